@@ -73,6 +73,15 @@ class DaqError(Exception):
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
+def counted(count: int, noun: str) -> str:
+    """Write a number of things: ``1 entry``, ``2 entries``."""
+    if count == 1:
+        return f"{count} {noun}"
+    if noun.endswith("y"):
+        return f"{count} {noun[:-1]}ies"
+    return f"{count} {noun}s"
+
+
 def evidence(error: Exception) -> str:
     """Return where and what an error found, without its remedy: for a warning about work that is done all the same."""
     return f"{error.subject}: {error.found}" if isinstance(error, DaqError) else str(error)

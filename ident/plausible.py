@@ -46,6 +46,28 @@ def range_text(bounds: tuple[float, float]) -> str:
     return f"{bounds[0]:g} to {bounds[1]:g}"
 
 
+def format_at_limit(value: float, limit: float, digits: int, form: str = "f") -> str:
+    """Format a number with as many digits as show on which side of a limit it is.
+
+    1.004 is above a limit of 1, and "1.00" would not say so.
+
+    Args:
+        value: number that is compared by its size.
+        limit: it is compared with, as it is written elsewhere in the message.
+        digits: of the format, where these are enough.
+        form: of the format: ``f``, ``g``, or ``+f`` with the sign of positive numbers, too.
+    """
+    sign = form[:-1]
+    kind = form[-1]
+    is_beyond = abs(value) > limit
+    text = ""
+    for precision in range(digits, 18):
+        text = f"{value:{sign}.{precision}{kind}}"
+        if (abs(float(text)) > limit) == is_beyond:
+            break
+    return text
+
+
 def within(value: float, bounds: tuple[float, float]) -> bool:
     """Whether a number is in a range; NaN is in none."""
     return bounds[0] <= value <= bounds[1]

@@ -132,8 +132,13 @@ class WeighedBody:
 
     @property
     def size(self) -> FloatArray:
-        """m a², m a and m of a steel cube of side a with the body's mass: compact, hence small, shape (10,)."""
-        mass = abs(self.mass_kg) if np.isfinite(self.mass_kg) else 1.0
+        """m a², m a and m of a steel cube of side a: compact, hence small, shape (10,).
+
+        Its mass is the least one that these moves allow, m − 2 σ; 1 kg where they do not show the mass.
+        """
+        mass = 1.0
+        if np.isfinite(self.mass_kg):
+            mass = max(abs(self.mass_kg) - 2.0 * self.mass_std_kg, 0.0)
         side = side_of_cube(mass)
         return np.array([mass * side**2] * 6 + [mass * side] * 3 + [mass])
 
@@ -142,9 +147,13 @@ class WeighedBody:
         """Parameters known to KNOWN of their value, or to less than what a compact body of this mass has, shape (10,).
 
         The second counts for a parameter near zero, the first for one with a long lever, such as Izz about a far joint.
+        The mass itself has the first alone.
         """
         std = np.nan_to_num(self.std, nan=np.inf)
-        return np.asarray((std <= KNOWN * np.abs(np.nan_to_num(self.values))) | (2.0 * std < self.size))
+        is_known = std <= KNOWN * np.abs(np.nan_to_num(self.values))
+        is_small = 2.0 * std < self.size
+        is_small[-1] = False
+        return np.asarray(is_known | is_small)
 
     def _derived(self, quantity: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
         with np.errstate(invalid="ignore"):  # NaN is what depends on a parameter that is not shown

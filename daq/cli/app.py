@@ -209,6 +209,7 @@ BY_JOB = {
 }
 """Verbs by job, in the order of the help; each is imported when it is called."""
 VERBS = tuple(chain.from_iterable(BY_JOB.values()))
+VERB_NAMES = frozenset(verb.name for verb in VERBS)
 ALIASES = {"report": "certificate", "install-units": "schedule"}
 """Names of earlier versions, which go on working; the help and the completion do not list them."""
 
@@ -304,7 +305,7 @@ def _run(words: list[str], json_wanted: bool) -> int:
     except (DaqError, DriverError, IdentificationError) as error:
         if isinstance(error, OutputFailed) and _kept():
             error.add_note(f"kept: {_kept()}")
-        failure = ErrorParts.of(error)
+        failure = ErrorParts.of(error, _verb_of(words))
         show_failure(failure, json_wanted=json_wanted)
         return failure.exit_code
     except OSError as error:
@@ -317,29 +318,40 @@ def _run(words: list[str], json_wanted: bool) -> int:
         say_last("interrupted: no file was written")  # Ctrl-C or Ctrl-D at a prompt
         ended = ExitCode.INTERRUPTED
     except CLICK_ERROR as error:
-        ended = _usage_failed(error, json_wanted)
+        ended = _usage_failed(error, words, json_wanted)
     return ended if isinstance(ended, int) else ExitCode.OK
 
 
-def _usage_failed(error: Any, json_wanted: bool) -> int:
+def _verb_of(words: list[str]) -> str:
+    """Return the verb of a command line; empty where it has none."""
+    return next((word for word in words if word in VERB_NAMES), "")
+
+
+def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
     """Report a command line that cannot be parsed."""
-    if error.ctx is None or "Usage:" in error.message:
+    if "Usage:" in error.message:
         error.show()  # a verb without arguments shows its help
         return ExitCode.USAGE
+    command = "drivegain"
+    usage = "a value for this option"
+    if error.ctx is not None:
+        command = error.ctx.command_path
+        usage = error.ctx.get_usage()
+    elif verb := _verb_of(words):  # the parser knows no verb where an option ends the line without its value
+        command = f"drivegain {verb}"
     found = str(error.format_message())
     param = getattr(error, "param", None)
     if param is not None:
         shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
-    remedy = f"`{error.ctx.command_path} --help` explains it"
-    usage = error.ctx.get_usage()
+    remedy = f"`{command} --help` explains it"
     # A value of the wrong type: the message of typer's validation does not repeat it.
     given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]
     if len(given) == 1 and isinstance(given[0], str):
         found = f"{given[0]!r}: {found}"
         if re.fullmatch(r"[+-]?\d*,\d+", given[0]):
             remedy = f"write a decimal point: {given[0].replace(',', '.')}"
-    failure = ErrorParts("UsageError", error.ctx.command_path, found, usage, remedy, ExitCode.USAGE)
+    failure = ErrorParts("UsageError", command, found, usage, remedy, ExitCode.USAGE)
     show_failure(failure, json_wanted=json_wanted)
     return ExitCode.USAGE
 

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from daq.advice import for_command_line
 from daq.errors import DaqError, ExitCode, exit_code
-from daq.report.text import printable, spelled_bytes
+from daq.report.text import break_lines, printable, spelled_bytes
 from drivers import errors as driver
 from ident import errors as identification
 
@@ -88,15 +88,16 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     identification.DataUnfit: ("runs that can be used", "leave the run out, or record it again"),
     identification.TooFewMoves: (
         "enough moves to judge the scatter",
-        "record a longer plan (`plan --duration 60`), or give more logs",
+        "record a plan with more moves (`plan --duration`), or give more logs",
     ),
     identification.RankDeficient: (
         "moves that identify every unknown",
         "record runs without load and with the payload, with a plan of `drivegain plan`",
     ),
     identification.PayloadUnseen: (
-        "a payload that the moves can feel",
-        "use a heavier payload or a plan of `drivegain plan`",
+        "the payload in every run that declares it, in no other, and heavy enough for the moves to show it",
+        "check what was mounted in each run (`drivegain info LOG` shows what it declares) and record the wrong one "
+        "again; if all are right, use a heavier payload or a plan of `drivegain plan`",
     ),
     identification.NotConverged: ("a fit that settles", "check the cell file, or try `fit --method wls`"),
     identification.EffectImpossible: (
@@ -113,6 +114,40 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     ),
 }
 """Expected and remedy by class of error, the nearest class first, where the error has none of its own."""
+
+_CHECK_NODE = "check the drive's supply, its wiring, and `node_id` and `drive` of the axis in the cell file"
+ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
+    "scan": {
+        driver.NodeMissing: (
+            "an answer from every axis of the cell file",
+            "check, in this order, the supply of the drives, wiring and termination (60 Ω between CAN_H and CAN_L "
+            "without power), the bit rate, and the node ids; `--wait 2` waits longer",
+        ),
+        driver.NodeMisplaced: (
+            "every axis on the bus that the cell file names",
+            "correct the wiring or the cell file",
+        ),
+        driver.StateRefused: (
+            "a drive that follows the commands of CiA 301 and CiA 402",
+            "check the power stage and the safety chain, and the fault on the drive's display",
+        ),
+        driver.DriveFault: (
+            "a fault that can be reset",
+            "remove its cause (`drivegain explain-emcy CODE` explains a code), then reset it again",
+        ),
+        driver.NodeError: ("an amplifier as the cell file describes it", _CHECK_NODE),
+        driver.SetupRefused: ("the drive that the cell file describes", _CHECK_NODE),
+    },
+    "monitor": {
+        driver.SampleLost: (
+            "an answer from every axis to every SYNC",
+            "check the power of the cell and the load of bus and computer",
+        ),
+        driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain scan CELL` lists the nodes"),
+        driver.BusBusy: ("no other master on the bus", "end the other program"),
+    },
+}
+"""The same within a verb that `ADVICE` would propose to run: its user has just done so."""
 
 _BY_NUMBER: dict[int, tuple[str, str, str]] = {
     errno.ECONNREFUSED: (
@@ -171,11 +206,11 @@ class ErrorParts:
     powered: str = ""  #: axes that had power and are not confirmed without it
 
     @classmethod
-    def of(cls, error: Exception) -> ErrorParts:
-        """Take an error of `daq`, `drivers` or `ident` apart."""
+    def of(cls, error: Exception, verb: str = "") -> ErrorParts:
+        """Take an error of `daq`, `drivers` or `ident` apart; `verb` is the one that raised it."""
         notes = getattr(error, "__notes__", ())
         labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
-        subject, found, expected, remedy = map(for_command_line, _parts(error))
+        subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
         return cls(
             type(error).__name__,
             subject,
@@ -228,7 +263,7 @@ def may_have_power(error: BaseException | None) -> str:
     return ", ".join(note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED))
 
 
-def _parts(error: Exception) -> tuple[str, str, str, str]:
+def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
     """Subject, found, expected and remedy."""
     if isinstance(error, DaqError | WITH_EVIDENCE):
         return error.subject, error.found, error.expected, error.remedy
@@ -238,7 +273,8 @@ def _parts(error: Exception) -> tuple[str, str, str, str]:
             return f"bus {error.address}", *known
     if isinstance(error, driver.MotionRefused) and error.remedy:
         return "motion is refused", error.found, error.expected, error.remedy
-    advice = next((ADVICE[kind] for kind in type(error).__mro__ if kind in ADVICE), ("", ""))
+    known_advice = ADVICE | ADVICE_WITHIN.get(verb, {})
+    advice = next((known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", ""))
     return str(error), str(error), *advice
 
 
@@ -251,6 +287,9 @@ def _number(error: BaseException | None) -> int | None:
             return error.errno
         error = error.__cause__
     return None
+
+
+INDENT = 10  #: Columns of the labels of an error
 
 
 def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
@@ -266,5 +305,8 @@ def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
             return
         for label, text, style in failure.lines():
             # Indented, a line end in the name of a file cannot make another line of an error.
-            indented = printable(text).replace("\n", "\n" + 10 * " ")
-            console.print(Text(f"{label + ':':<10}", style=style) + Text(indented))
+            shown = printable(text)
+            if console.is_terminal:
+                shown = break_lines(shown, max(console.width - INDENT, 1))
+            indented = shown.replace("\n", "\n" + INDENT * " ")
+            console.print(Text(f"{label + ':':<{INDENT}}", style=style) + Text(indented))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.cli.next_step import free_name, say_after_calibration, say_after_fit, say_next
 from daq.cli.terminal import (
     at_most_one,
     check_folder,
@@ -19,9 +20,9 @@ from daq.cli.terminal import (
     check_replaceable,
     make_folder,
     print_view,
+    replace_output,
     require_different,
     status,
-    write_output,
 )
 from daq.cli.verb import (
     CellOption,
@@ -29,8 +30,6 @@ from daq.cli.verb import (
     corrected_cell,
     output_option,
     print_json,
-    say_correct_first,
-    say_next,
     taking,
 )
 from daq.errors import OutputFailed, UsageError, writing
@@ -167,7 +166,7 @@ def fit_verb(request: FitRequest) -> None:
         print_json(fit_report(found, calibration, comparison))
         return
     print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
-    say_after_fit(calibration, [*request.logs, *request.options()], request.out or Path("calibration.yaml"))
+    say_after_fit(calibration, [*request.logs, *request.options()], request.out)
 
 
 def _fit(request: FitRequest) -> CaseFit:
@@ -199,16 +198,6 @@ def _fit(request: FitRequest) -> CaseFit:
     if request.essential is None:
         return found
     return replace(essential_fit(found.fitted, request.essential), payloads=found.payloads)
-
-
-def say_after_fit(calibration: Calibration, arguments: Sequence[object], out: Path) -> None:
-    """Print the next step: the search for what the model lacks, unless the robot is described wrongly."""
-    from daq.writeback.gates.fit import uncorrected_description
-
-    if uncorrected_description(calibration):
-        say_correct_first()
-    else:
-        say_next("drivegain", "residual", *arguments, "--out", out, "--report", "report")
 
 
 def _fit_cases(request: FitRequest, folder: Path) -> None:
@@ -247,7 +236,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
             )
         calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
     tables = case_tables(calibrations)
-    with write_output(folder):
+    with replace_output(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
             save_calibration(calibrations[name], file)
@@ -313,7 +302,7 @@ def residual_verb(request: ResidualRequest) -> None:
 
     try:
         if request.report is not None:
-            with status("drawing the report"), write_output(request.report):
+            with status("drawing the report"), replace_output(request.report):
                 save_report(closed, changed, calibration, request.report)
         check_holdout(closed)
         _save(closed, calibration, request.out, request.pictures)
@@ -322,7 +311,7 @@ def residual_verb(request: ResidualRequest) -> None:
         raise
     show(request.out, request.report, request.pictures)
     if not request.json:
-        _say_after_search(request)
+        _say_after_search(request, calibration)
 
 
 def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
@@ -345,11 +334,10 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
     return replace(found, accept_worse_holdout=request.accept_worse_holdout)
 
 
-def _say_after_search(request: ResidualRequest) -> None:
-    """Print the next step: the calibration tested on other logs, or the same search with a calibration to write."""
+def _say_after_search(request: ResidualRequest, calibration: Calibration) -> None:
+    """Print the next step: what would be written to the controller, or the same search with a calibration to write."""
     if request.out is not None:
-        described = [] if request.cell is None else ["--cell", request.cell]
-        say_next("drivegain", "validate", request.out, *(request.holdout or request.logs), *described)
+        say_after_calibration(calibration, request.out, request.logs, request.cell)
         return
     same = request.options()
     if request.seed:
@@ -360,8 +348,9 @@ def _say_after_search(request: ResidualRequest) -> None:
         "--write-undecided": request.write_undecided,
     }
     same += [name for name, given in switches.items() if given]
+    out = free_name(Path("calibration.yaml"))
     report = request.report or "report"
-    say_next("drivegain", "residual", *request.logs, *same, "--out", "calibration.yaml", "--report", report)
+    say_next("drivegain", "residual", *request.logs, *same, "--out", out, "--report", report)
 
 
 def check_report(folder: Path | None, out: Path | None = None) -> None:
@@ -396,7 +385,7 @@ def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> No
     from daq.report.residual_page import PAGE, beside_nameplate
 
     page = certificate_page(certify(calibration, beside_nameplate(fitted, calibration)))
-    with write_output(folder):
+    with replace_output(folder):
         replace_file(folder / PAGE, page.encode())
 
 
@@ -405,9 +394,9 @@ def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Pat
     from daq.report.plots import draw_fit
 
     if out is not None:
-        with write_output(out):
+        with replace_output(out):
             save_calibration(calibration, out)
     if pictures is not None:
-        with write_output(pictures):
+        with replace_output(pictures):
             pictures.mkdir(parents=True, exist_ok=True)
             draw_fit(fitted, calibration, None, pictures)

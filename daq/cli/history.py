@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, output_console, say_written, write_file
+from daq.cli.terminal import check_replaceable, output_console, say, say_written, write_file
 from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.errors import (
     AuditUnusable,
@@ -212,11 +212,11 @@ def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
         _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
         return
     if done.aside is None:
-        typer.echo(f"There is no history of an earlier version; {ledger.audit} is the history.", err=True)
+        say(f"There is no history of an earlier version; {ledger.audit} is the history.", err=True)
         return
-    typer.echo(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
+    say(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
     if done.flaws:
-        typer.echo(f"The old history was broken ({_first(done.flaws)}): what only it had was not taken over.", err=True)
+        say(f"The old history was broken ({_first(done.flaws)}): what only it had was not taken over.", err=True)
 
 
 def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime) -> None:
@@ -245,15 +245,15 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
         )
     before = verify_ledger(ledger).unknown
     new = enter_calibration(ledger, calibration, digest=hashlib.sha256(content).hexdigest(), who=who, at=now)
-    typer.echo(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
+    say(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
     checked = verify_ledger(ledger, _session_heads(ledger.cell))
     left = {write.ended.number for write in checked.unknown}
     for write in before:
         if write.ended.number not in left:
-            typer.echo(f"Entered too: {printable(str(write))}.", err=True)
+            say(f"Entered too: {printable(str(write))}.", err=True)
     if not checked.complete:
-        typer.echo("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.", err=True)
+        say("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.", err=True)
 
 
 def _day(text: str, now: datetime) -> datetime:

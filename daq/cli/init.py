@@ -10,8 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from daq.cli.terminal import write_output
-from daq.cli.verb import judged_output, say_next
+from daq.cli.next_step import say_next
+from daq.cli.terminal import say, write_output
+from daq.cli.verb import judged_output
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 
@@ -68,7 +69,10 @@ def init(
     """Create a folder for a new cell, with commented templates to fill in."""
     for path in make_cell_folder(folder, simulated=simulated):
         typer.echo(path)
-    say_next("drivegain", "scan", folder / "cells" / f"{folder.resolve().name}.yaml")
+    cell = folder / "cells" / f"{folder.resolve().name}.yaml"
+    if not simulated:
+        say(f"Edit {cell} first: its numbers are an example's, and its comments say what replaces them.", err=True)
+    say_next("drivegain", "scan", cell)
 
 
 def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:

@@ -15,15 +15,17 @@ from daq.cli.terminal import (
     output_console,
     print_view,
     progress_bar,
+    replace_output,
+    say,
     status,
-    write_output,
 )
 from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
 from daq.environment import require_packages, software
-from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError, counted
 from daq.files import replace_file
 from daq.report.text import printable
 from ident.errors import ModelContradicted
+from ident.plausible import format_at_limit
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -72,9 +74,9 @@ def import_files(
     if json:
         print_json(import_report(out, imported))
         return
-    typer.echo(f"{out}: {statistics.samples} samples of {len(statistics.missing)} axes")
+    say(f"{out}: {counted(statistics.samples, 'sample')} of {len(statistics.missing)} axes")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
-        typer.echo(printable(line))
+        say(printable(line))
 
 
 def salvage_verb(
@@ -97,11 +99,11 @@ def salvage_verb(
         print_json(salvage_report(out, saved))
         return
     use = ": `fit` accepts it and says so; `apply` refuses the result" if statistics.valid else ""
-    typer.echo(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")
+    say(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")
     if saved.left_out_bytes:
-        typer.echo(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
+        say(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
     if not statistics.valid:
-        typer.echo(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
+        say(f"INVALID: {printable(statistics.reason)}; a fit will refuse it")
 
 
 def export_verb() -> None:
@@ -130,15 +132,16 @@ def export_log_verb(
     if json:
         print_json(table_report(log, out, kind, done))
     else:
-        print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
+        rows = counted(done.rows, "row")
+        print_view([f"{rows} of {counted(len(done.columns), 'column')}"], out)
 
 
 def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
     """Say on stderr what a log lacks."""
     if partial:
-        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
+        say(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
     if not valid:
-        typer.echo(f"{log} is INVALID: {reason or 'no reason given'}; a fit refuses it", err=True)
+        say(f"{log} is INVALID: {reason or 'no reason given'}; a fit refuses it", err=True)
 
 
 def export_bag_verb(
@@ -163,7 +166,7 @@ def export_bag_verb(
     if json:
         print_json(bag_report(log, out, done, effort=known is not None))
     else:
-        print_view([f"{topic}: {count} messages" for topic, count in done.messages.items()], out)
+        print_view([f"{topic}: {counted(count, 'message')}" for topic, count in done.messages.items()], out)
 
 
 def export_urdf_verb(
@@ -204,7 +207,7 @@ def export_urdf_verb(
     if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
         raise ModelContradicted(
             str(calibration),
-            found=f"a relative error of {left:.3g} %",
+            found=f"a relative error of {format_at_limit(left, DOUBTFUL_PERCENT, 3, 'g')} %",
             expected=f"at most {DOUBTFUL_PERCENT:g} %",
             remedy="fit again; `drivegain fit` lists what to check",
         )
@@ -298,5 +301,5 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
                 remedy="nothing was written; please report this URDF",
             )
 
-    with write_output(out):
+    with replace_output(out):
         replace_file(out, updated.content, check=check)

@@ -5,22 +5,23 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain, count
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from daq.cli.next_step import say_after_plan
 from daq.cli.terminal import (
     check_folder,
     check_output,
     check_page,
     check_replaceable,
     progress_bar,
+    replace_output,
+    say,
     write_file,
-    write_output,
 )
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_STD_PERCENT
 
@@ -84,7 +85,7 @@ def plan_verb(
             experiment=experiment,
             progress=report,
         )
-    with write_output(out):
+    with replace_output(out):
         save_plan(made, out)
     if preview is not None:
         checked = load_plan(out, declared)
@@ -94,14 +95,8 @@ def plan_verb(
     if json:
         print_json(plan_report(out, declared, experiment, made, judged))
     else:
-        typer.echo(plan_text(out, preview, declared, experiment, made, judged))
-        say_next("drivegain", "record", cell, out, "--out", free_name(), "--enable-motion")
-
-
-def free_name() -> str:
-    """Name of a log that is not there yet; the first two are those of the help's examples."""
-    names = chain(("unloaded.mcap", "held-out.mcap"), (f"run-{number}.mcap" for number in count(3)))
-    return next(name for name in names if not Path(name).exists())
+        say(plan_text(out, preview, declared, experiment, made, judged, duration))
+        say_after_plan(cell, declared, out, made)
 
 
 @contextmanager
@@ -111,5 +106,5 @@ def say_how_to_resume(tried: list[int], exchanges: int) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if done := tried[-1]:
-            typer.echo(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
+            say(f"{done} of {exchanges} exchanges were tried; --exchanges {done} writes their plan", err=True)
         raise

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.advice import for_command_line
-from daq.cli.terminal import interruptible
+from daq.cli.terminal import interruptible, say
 from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.environment import login
 from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code, writing
@@ -102,7 +102,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
             if json:
                 print_json(DryRunReport(dry_run=True, remark=seen.remark, steps=list(seen.steps)))
             else:
-                typer.echo("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
+                say("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
         ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
         if ended.outcome is Outcome.APPLIED and fits:
@@ -114,7 +114,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     if json:
         print_json(conclusion_report(ended, cell))
     else:
-        typer.echo(printable(text(ended, cell)), nl=False)
+        say(printable(text(ended, cell)).removesuffix("\n"))
     if ended.exit_code:
         raise typer.Exit(ended.exit_code)
 
@@ -154,7 +154,7 @@ def schedule_verb(
     if cron:
         typer.echo(cron_line(wanted))
         if yes:
-            typer.echo("Not installed: add this line to the table that `crontab -e` opens.", err=True)
+            say("Not installed: add this line to the table that `crontab -e` opens.", err=True)
         return
     check_schedule(schedule)
     folder = to or (Path.home() / _OF_USER if user else _SYSTEM)

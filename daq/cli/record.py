@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import interruptible, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, say_next, taking
+from daq.cli.next_step import say_after_record
+from daq.cli.terminal import interruptible, progress_bar, say, say_last
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
 from daq.environment import login
-from daq.errors import DaqError, DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError, counted
 from daq.files import is_taken
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
@@ -72,7 +73,7 @@ def record_verb(options: RecordOptions) -> None:
     part = _free(out)
     not_weighed = carried is not None and options.mass is None
     for line in _before_motion(declared, options.plan, not_weighed):
-        typer.echo(line, err=True)
+        say(line, err=True)
     request = RecordingRequest(
         options.cell,
         declared,
@@ -94,7 +95,7 @@ def record_verb(options: RecordOptions) -> None:
             progress_bar("recording") as report_progress,
         ):
             if feed.remark:
-                typer.echo(feed.remark, err=True)
+                say(feed.remark, err=True)
             done = record(
                 request,
                 block_signals=block_signals,
@@ -109,17 +110,17 @@ def record_verb(options: RecordOptions) -> None:
         _add_what_is_kept(error, declared, part)
         raise
     for warning in done.warnings:
-        typer.echo(warning, err=True)
+        say(warning, err=True)
     if options.json:
         print_json(record_report(out, done, declared))
     else:
         verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
-        typer.echo(f"{out}: {done.log.samples} samples, {done.log.lost_cycles} cycles lost, {verdict}")
+        say(f"{out}: {done.log.samples} samples, {counted(done.log.lost_cycles, 'cycle')} lost, {verdict}")
     if not done.log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
     if not options.json:
-        _say_next(options.cell, declared, options.plan, out, carried)
+        say_after_record(options.cell, declared, options.plan, out)
 
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
@@ -138,30 +139,6 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
             else "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
             "lockstep` in the cell file"
         )
-
-
-def _say_next(cell: Path, declared: Cell, plan: Path, out: Path, carried: Payload | None) -> None:
-    """Name the run with the payload after one without, and the fit of both where it is plain which these are."""
-    if carried is None:
-        if declared.payloads:
-            weighed = ("--payload", declared.payloads[0].payload.name, "--mass", "KG")
-            say_next("drivegain", "record", cell, plan, "--out", "loaded.mcap", *weighed, "--enable-motion")
-        return
-    others = [path for path in out.parent.glob("*.mcap") if path != out]
-    calibration = out.with_name("calibration.yaml")
-    if len(others) == 1 and not calibration.exists() and _is_unloaded(others[0], declared):
-        say_next("drivegain", "fit", *others, out, "--out", calibration)
-
-
-def _is_unloaded(log: Path, declared: Cell) -> bool:
-    """Whether a log is a valid run of this cell without load."""
-    from daq.report.log import info_report
-
-    try:
-        found = info_report(log)
-    except DaqError:
-        return False
-    return (found.cell, found.payload, found.valid) == (declared.name, None, True)
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:

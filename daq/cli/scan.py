@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import print_view
-from daq.cli.verb import CellArgument, JsonOption, print_json, read_cell, say_next
+from daq.cli.next_step import say_next
+from daq.cli.terminal import print_view, say
+from daq.cli.verb import CellArgument, JsonOption, print_json, read_cell
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 
@@ -38,6 +39,8 @@ def scan_verb(
     with the motors' data in the drives and with the controller's file. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it. While a recording or
     another master uses the bus, nothing is sent: exit code 12 or 5.
+    Exit code 5 also where an axis does not answer; what else is wrong is in the table, as another
+    serial number is, and `record` refuses it.
     """
     from daq.config.cell_buses import bus_parts, drive_axes
     from daq.report.bus_views import scan_report, scan_view, scanned_nodes
@@ -186,7 +189,7 @@ def explain_emcy_verb(
     if json:
         print_json(error_code_report(found))
     else:
-        typer.echo(f"{found.hex}: {found.text}\nWhat to do: {found.remedy}.")
+        say(f"{found.hex}: {found.text}\nWhat to do: {found.remedy}.")
 
 
 def read_code(text: str) -> int:

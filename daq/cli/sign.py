@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.terminal import print_view
+from daq.cli.terminal import print_view, say
 from daq.cli.verb import (
     CalibrationArgument,
     JsonOption,
@@ -55,7 +55,7 @@ def sign_key_verb(
         return
     entry = f"For the cell file, under `policy: {{apply: {{signers: …}}}}`:\n  {name}: {public.line}"
     print_view([entry], secret, secret.with_suffix(".pub"))
-    typer.echo(f"Keep {secret.name} secret: anyone who has it can sign as {name}.")
+    say(f"Keep {secret.name} secret: anyone who has it can sign as {name}.")
 
 
 def sign_calibration_verb(

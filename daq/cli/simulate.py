@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, show_steps, write_output
+from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, replace_output, say, show_steps
 from daq.cli.verb import JsonOption, output_option, print_json
-from daq.errors import ConfigurationInconsistent, UsageError
+from daq.errors import ConfigurationInconsistent, UsageError, counted
 from daq.files import read_regular, replace_file
 from daq.report.text import Sentence
 from drivers.canopen.interfaces import SOCKETCAND, interface_of
@@ -76,7 +76,7 @@ def simulate(
         mounted = MountedFile(
             payload_from,
             partial(load_simulation, truth),
-            lambda error: typer.echo(f"{error}; the mounted body stays", err=True),
+            lambda error: say(f"{error}; the mounted body stays", err=True),
         )
     spec = load_simulation(truth, payload) if mounted is None else mounted.at_power_on()
     if faults is not None:
@@ -104,7 +104,7 @@ def simulate(
             raise ConfigurationInconsistent(str(truth), found=str(error), expected=expected, remedy=remedy) from error
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
-        typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
+        say(f"{counted(len(spec.axes), 'amplifier')} on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
         typer.echo(how_to_reach(parts, spec.sync_period_us))
         with bus_errors(address):
             cell.serve_forever()
@@ -220,7 +220,7 @@ def demo(
 
     began = time.monotonic()
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
-    with write_output(out):
+    with replace_output(out):
         with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         report = demo_report(outcome, seconds=round(time.monotonic() - began, 1))
@@ -231,8 +231,8 @@ def demo(
     print_view(demo_view(outcome))
     show_proposal(outcome.proposal, output_console())
     if outcome.written is not None:
-        typer.echo(f"Written to the copy {outcome.written.edit.subject}.")
-    typer.echo(f"\nLogs, calibration.yaml, pictures, summary.json and report/report.html are in {out}.")
+        say(f"Written to the copy {outcome.written.edit.subject}.")
+    say(f"\nLogs, calibration.yaml, pictures, summary.json and report/report.html are in {out}.")
 
 
 def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:

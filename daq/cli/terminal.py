@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
+import stat
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
 from daq.files import is_taken, replace_file
-from daq.report.text import terminal_text
+from daq.report.text import break_lines, terminal_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -51,9 +57,55 @@ def write_output(path: Path) -> Iterator[None]:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all, within `write_output`."""
-    with write_output(path):
+    """Write a file whole or not at all, within `replace_output`."""
+    with replace_output(path):
         replace_file(path, content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def replace_output(path: Path) -> Iterator[None]:
+    """Write a file or folder within the block, as `write_output`, and say on stderr which files were there before.
+
+    What can be made again, such as a plan or a calibration, may replace an earlier file of its kind
+    (`check_replaceable`); a log replaces nothing.
+    """
+    before = _files_of(path)
+    with write_output(path):
+        yield
+    after = _files_of(path)
+    replaced = [file for file, state in before.items() if file in after and after[file] != state]
+    if not replaced:
+        return
+    oldest_ns = min(before[file].modified_ns for file in replaced)
+    since = datetime.fromtimestamp(oldest_ns / 1e9, UTC)
+    names = [str(file) for file in replaced[:NAMED_FILES]]
+    if len(replaced) > NAMED_FILES:
+        names.append(f"{len(replaced) - NAMED_FILES} more")
+    replaced_text = terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)")
+    say(replaced_text.plain, err=True)
+
+
+NAMED_FILES = 4  #: Replaced files that are named; of more, their number is said
+
+
+@dataclass(frozen=True, slots=True)
+class _FileState:
+    """What differs after a file was replaced."""
+
+    inode: int
+    modified_ns: int
+
+
+def _files_of(path: Path) -> dict[Path, _FileState]:
+    """Return a file, or each file in a folder, by name; empty where there is none."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = {}
+    for file in files:
+        with suppress(OSError):  # it is not there
+            status = file.stat()
+            if stat.S_ISREG(status.st_mode):
+                found[file] = _FileState(status.st_ino, status.st_mtime_ns)
+    return found
 
 
 def make_folder(folder: Path) -> None:
@@ -151,9 +203,36 @@ def at_most_one(**options: object) -> None:
         )
 
 
+class _WholeWords(Console):
+    """Console that breaks long lines of text at spaces, where a terminal would break them within a word."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print as rich does, with lines of text that fit a terminal."""
+        shown = objects
+        if self.is_terminal:
+            shown = tuple(self._fitting(one) for one in objects)
+        super().print(*shown, **options)
+
+    def _fitting(self, one: Any) -> Any:
+        if isinstance(one, str):
+            return break_lines(one, self.width)
+        if isinstance(one, Text) and not one.spans:
+            return Text(break_lines(one.plain, self.width), style=one.style)
+        return one
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print text for a person; a terminal gets lines broken at spaces, a pipe or file gets them as they are."""
+    stream = sys.stderr if err else sys.stdout
+    shown = text
+    if stream is not None and stream.isatty():
+        shown = break_lines(text, shutil.get_terminal_size().columns)
+    typer.echo(shown, err=err)
+
+
 def output_console() -> Console:
     """Console of stdout; a pipe has no width, so nothing in it is broken into lines."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+    console = _WholeWords(soft_wrap=True, highlight=False, markup=False)
     if not console.is_terminal:
         console.width = PIPE_COLUMNS
     return console
@@ -163,7 +242,7 @@ PIPE_COLUMNS = 1_000  #: Wider than any table
 
 
 def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
-    """Print tables and lines on stdout, then the files written; lines are not broken, so that they can be copied."""
+    """Print tables and lines on stdout, then the files written; a terminal breaks lines between words alone."""
     console = output_console()
     for part in parts:
         console.print(part)
@@ -183,7 +262,7 @@ def say_written(console: Console, *paths: Path | None) -> None:
 def say_last(text: str) -> None:
     """Print the last line of a command on stderr; the exit code says it where that takes nothing."""
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
-        typer.echo(text, err=True)
+        say(text, err=True)
 
 
 class Stepper:

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import check_output, print_view, status, write_output
+from daq.cli.next_step import say_after_calibration
+from daq.cli.terminal import check_output, print_view, replace_output, status
 from daq.cli.verb import (
     CalibrationArgument,
     CellOption,
     JsonOption,
-    cells_in,
     corrected_cell,
     output_option,
     print_json,
     read_calibration,
-    read_cell,
-    say_correct_first,
-    say_next,
 )
-from daq.errors import CalibrationMissing, DaqError
+from daq.errors import CalibrationMissing
 from daq.files import replace_file
 
 if TYPE_CHECKING:
@@ -56,7 +52,6 @@ def validate_verb(
     from daq.report.paper_tables import paper_page
     from daq.report.validation import draw_validations, validate_report, validation_tables, validation_view
     from daq.workflow.validate import cross_validate
-    from daq.writeback.gates.fit import uncorrected_description
 
     page_file = None if out is None else out / "tables.md"
     check_output(page_file, (calibration, *logs), TABLES)
@@ -66,40 +61,18 @@ def validate_verb(
         known = next(iter(calibrations.values()))
         found = cross_validate(calibrations, logs, corrected_cell(cell))
         if pictures is not None:
-            with write_output(pictures):
+            with replace_output(pictures):
                 drawn = draw_validations(known, found.validations, pictures)
     if page_file is not None:
         tables = validation_tables(found, complete=True)
-        with write_output(page_file):
+        with replace_output(page_file):
             page_file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(page_file, paper_page(f"Validation of {known.cell}", tables, marker=TABLES).encode())
     if json:
         print_json(validate_report(known, found, drawn))
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
-        if uncorrected_description(known):
-            say_correct_first()
-        elif not known.gains_fixed:  # every gate of such gains is closed
-            say_next("drivegain", "apply", cell or cell_of(known, logs), calibration)
-
-
-def cell_of(calibration: Calibration, logs: list[Path]) -> Path:
-    """Find the cell file of a calibration, here or beside its logs; CELL, to be filled in, where it is not certain.
-
-    Several files may describe a cell of that name, as the shipped one and a copy of it. The one with the content that
-    the logs of the fit carry is meant.
-    """
-
-    folders = dict.fromkeys([Path(), *(log.parent for log in logs)])
-    found = {os.path.realpath(path): path for folder in folders for path in cells_in(folder, calibration.cell)}
-    recorded = []
-    for path in found.values():
-        with suppress(DaqError):
-            if read_cell(path).recording_digest == calibration.recording_configuration_sha256:
-                recorded.append(path)
-    # Without the fit's own one, the only one of that name may be it, edited since.
-    likely = recorded or list(found.values())
-    return likely[0] if len(likely) == 1 else Path("CELL")
+        say_after_calibration(known, calibration, logs, cell)
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
@@ -170,7 +143,7 @@ def contact_verb(
         known = read_calibration(calibration)
         found, described = contact_in(known, log, quiet=quiet or (), cell=corrected_cell(cell))
         if pictures is not None:
-            with write_output(pictures):
+            with replace_output(pictures):
                 pictures.mkdir(parents=True, exist_ok=True)
                 picture = draw_contact(found, described, log, pictures)
     if json:

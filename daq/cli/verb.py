@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -314,17 +313,6 @@ def continued(command: str, width: int, indent: str = "") -> list[str]:
             longer = f"{indent}  {word}"
         line = longer
     return [*lines, line]
-
-
-def say_next(*words: object) -> None:
-    """Print the command of the next step on stderr, quoted for a shell; without `--json` only."""
-    # Written names of things that the user has to fill in, such as CELL, need no quotes.
-    typer.echo("Next: " + " ".join(shlex.quote(str(word)) for word in words), err=True)
-
-
-def say_correct_first() -> None:
-    """Print on stderr that the description comes before every other step."""
-    typer.echo("Next: correct the description as CHECK says, then fit the logs again.", err=True)
 
 
 def print_json(document: Report) -> None:

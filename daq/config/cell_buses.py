@@ -188,7 +188,7 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
     used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
     for index, axis in enumerate(model.axes):
         if model.buses:
-            for key in ("node_id", "drive", "identity", "counts_per_revolution"):
+            for key in ("node_id", "drive", "counts_per_revolution"):
                 if getattr(axis, key) is None:
                     yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
         where = ("axes", index, "bus")

@@ -16,6 +16,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
 from daq.config.cell_closures import ChainModel, ClosureModel
 from daq.config.controller import Controller
+from daq.config.document_kind import DocumentKind
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection, Permission
 from daq.config.recalibration import RecalibrationSection
 from daq.config.workspace import ClearanceSection, WorkspaceSection
@@ -55,10 +56,10 @@ Buses = Annotated[
 
 
 class IdentityModel(StrictModel):
-    """Object 1018h."""
+    """Object 1018h; what is left out is not compared."""
 
     vendor_id: U32
-    product_code: U32
+    product_code: U32 | None = None
     serial: U32 | None = None
 
 
@@ -250,6 +251,7 @@ class CellModel(StrictModel):
     """A whole cell file."""
 
     reference: ClassVar[str] = "cell-file.md"
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.CELL
 
     name: Name
     robot: RobotModel

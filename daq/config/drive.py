@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import Fault, Positive, StrictModel, fault_texts, parse_yaml, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent
@@ -196,6 +197,7 @@ class DriveModel(StrictModel):
     """A whole drive profile file."""
 
     reference: ClassVar[str] = "schemas.md"
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.DRIVE_PROFILE
 
     name: Annotated[str, Field(min_length=1)]
     position: SignalModel

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import (
     Fault,
     FileName,
@@ -177,6 +178,7 @@ class ImportDescription(StrictModel):
     """A whole import description."""
 
     reference: ClassVar[str] = "schemas.md"
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.IMPORT
 
     name: Name  #: name of the recording
     cell: FileName  #: cell file, relative to this one

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, g
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
+from daq.config.document_kind import IN_ORDER, DocumentKind, kind_of_head, kind_of_tree
 from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid, reason_of
 from daq.files import follow_links, read_regular
 
@@ -62,6 +63,9 @@ class StrictModel(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
     reference: ClassVar[str] = ""  #: page of docs/reference with every key, for a file that people write
+    document_kind: ClassVar[DocumentKind | None] = (
+        None  #: of a whole file; None for a section, and for a file of programs alone
+    )
 
 
 Model = TypeVar("Model", bound=StrictModel)
@@ -134,13 +138,9 @@ def parse_yaml(text: bytes, name: str) -> Document:
             expected=f"a configuration of at most {MAX_BYTES} bytes",
             remedy="is this the right file?",
         )
-    if text.startswith(b"\x89MCAP"):
-        raise YamlInvalid(
-            name,
-            found="a log (MCAP)",
-            expected="a file in YAML",
-            remedy="give the files in the order of the command's help",
-        )
+    other = kind_of_head(text)
+    if other is not None:
+        raise YamlInvalid(name, found=other.value, expected="a file in YAML", remedy=IN_ORDER)
     lines: dict[Location, int] = {}
     try:
         _check_events(text, name)
@@ -218,6 +218,21 @@ def not_in_file(kind: str) -> str:
     return _NOT_IN_FILE + kind
 
 
+def kind_of_file(path: Path) -> DocumentKind | None:
+    """Return the kind of a file, for a message; None for one that cannot be read, and for one of no known kind."""
+    try:
+        content = read_regular(path, MAX_BYTES)
+    except OSError:
+        return None
+    known = kind_of_head(content)
+    if known is not None:
+        return known
+    try:
+        return kind_of_tree(parse_yaml(content, str(path)).tree)
+    except YamlInvalid:
+        return None
+
+
 def read_yaml_bytes(path: Path) -> bytes:
     """Read a configuration file of at most MAX_BYTES.
 
@@ -261,13 +276,21 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
         page = f"; docs/reference/{model.reference} has every key" if model.reference else ""
+        kind = kind_of_tree(document.tree)
+        if model.document_kind is not None and kind not in (None, model.document_kind):
+            raise SchemaMismatch(
+                document.name,
+                found=kind.value,
+                expected=model.document_kind.value,
+                remedy=f"{IN_ORDER} (CELL comes first){page}",
+            ) from error
         required = [name for name, field in model.model_fields.items() if field.is_required()]
         if len(required) > 1 and isinstance(document.tree, dict) and not document.tree.keys() & set(required):
             raise SchemaMismatch(
                 document.name,
                 found=f"a file of another kind, with {', '.join(list(document.tree)[:MAX_EXPLAINED]) or 'no key'}",
                 expected=f"a file with {', '.join(required)}",
-                remedy=f"give the files in the order of the command's help (CELL comes first){page}",
+                remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]

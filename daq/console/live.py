@@ -44,6 +44,7 @@ KEPT_EVENTS = 500
 DISK_S = 1.0  #: Time between two looks at the free space of the disk
 READ_S = 0.03  #: Time between two looks at the feed
 LARGEST_TURN = 100  #: Packets at one look; requests are answered between two
+RATE_S = 0.1  #: Shortest time over which a rate of samples is taken
 RETRY_S = 0.5  #: Time between two tries to find a feed
 OLD_S = {"running": 2.0, "watching": 65.0}  #: Silence after which values are old; readings of a monitor are rare
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
@@ -222,15 +223,17 @@ class Live:
 
     def status(self) -> dict[str, Any]:
         """Return everything that is shown as a number or a word."""
-        # A simulated cell in lockstep runs faster than its time, on no real bus.
-        lockstep = self.cell.sync is not None and self.cell.sync.pacing is PacingMode.LOCKSTEP
-        computed = {} if self.run is None or lockstep else self.run.bus_load
-        share = 0.0 if self.run is None else self.rate_hz / self.run.rate_hz
+        computed: dict[str, float] = {}
+        share = 0.0
+        if self.run is not None and not self._is_simulated:
+            computed = self.run.bus_load
+            share = self.rate_hz / self.run.rate_hz
         return {
             "phase": self.phase,
             "axes": [] if self._last is None else self._axes(self._last),
             **{"samples": self.samples, "lost": self.lost, "missing": self.missing, "dropped": self.dropped},
-            "rate_hz": round(self.rate_hz, 1),
+            "rate_hz": round(self._shown_rate_hz, 1),
+            "simulated": self._is_simulated,
             "moves": 0 if self.run is None else self.run.moves,
             "done": self.done,
             "bus_load": self._measured or {bus: share * load for bus, load in computed.items()},
@@ -277,7 +280,21 @@ class Live:
         if len(self._rate) < 2 or self._silent_s or self.phase not in ("running", "watching"):
             return 0.0
         (begin_s, first), (end_s, last) = self._rate[0], self._rate[-1]
-        return (last - first) / max(end_s - begin_s, 1e-3)
+        if end_s - begin_s < RATE_S:
+            return 0.0  # packets that wait for the page arrive together
+        return (last - first) / (end_s - begin_s)
+
+    @property
+    def _is_simulated(self) -> bool:
+        """Whether the cell runs in lockstep: as fast as its computer can, in a time of its own, on no real bus."""
+        return self.cell.sync is not None and self.cell.sync.pacing is PacingMode.LOCKSTEP
+
+    @property
+    def _shown_rate_hz(self) -> float:
+        """Samples a second of the cell's own time; 0 where none come."""
+        if self._is_simulated and self.run is not None and self.rate_hz > 0.0:
+            return self.run.rate_hz
+        return self.rate_hz
 
     def _free_bytes(self) -> int | None:
         if self.run is not None and self.run.log is not None and time.monotonic() - self._free_s > DISK_S:

@@ -1,6 +1,7 @@
 // The console's page: what the server sends is kept for two minutes, drawn on canvases and written as text, never as
 // markup. `drivegain` on the window holds it, for the tests.
-const shown = { kept: 0, run: null, points: [], rows: [], events: [], status: null, received: 0 };
+const shown = { kept: 0, run: null, points: [], rows: [], events: [], status: null, received: 0,
+  showAxis: (index, status) => showAxis(axes[index], status) };
 window.drivegain = shown;
 const byId = (id) => document.getElementById(id);
 const axes = [];
@@ -40,7 +41,7 @@ function number(value, digits) {
 function withDeviation(value, std) {
   if (std === 0) return `${Number(value.toPrecision(4))} (fixed)`;
   const digits = std > 0 ? Math.min(10, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
-  return `${number(value, digits)} ± ${number(std, digits)}`;
+  return `${number(value, digits)}\u00a0±\u00a0${number(std, digits)}`;
 }
 
 // ---- Axes
@@ -71,6 +72,15 @@ function buildAxis(axis, index) {
   axes.push({ ...axis, index, card, state, bar, marker, values, current, residual, begin });
 }
 
+// Why the bar of an axis is red; empty where it is not. The share is that of the range of the cell file.
+function limitText(share) {
+  if (share < 0) return "below its lower limit";
+  if (share > 1) return "above its upper limit";
+  if (share < NEAR) return "near its lower limit";
+  return share > 1 - NEAR ? "near its upper limit" : "";
+}
+const NEAR = 0.03;
+
 function showAxis(axis, status) {
   const now = status.axes[axis.index];
   if (!now) return;
@@ -79,11 +89,13 @@ function showAxis(axis, status) {
   axis.state.textContent = status.old ? `last: ${words}` : now.silent ? `${words}, DOES NOT ANSWER` : words;
   axis.state.title = now.state;
   axis.state.className = `state${now.fault || now.silent ? " fault" : now.power && !status.old ? " power" : ""}`;
-  axis.values.textContent =
-    `position ${number(now.position, 2)} ${axis.unit}, current ${number(now.current, 3)} ${axis.current_unit}`;
   const share = (now.position - axis.lower) / (axis.upper - axis.lower);
+  const near = limitText(share);
+  axis.values.textContent =
+    `position ${number(now.position, 2)} ${axis.unit}${near && `, ${near}`}, ` +
+    `current ${number(now.current, 3)} ${axis.current_unit}`;
   axis.marker.style.left = `calc(${100 * Math.min(1, Math.max(0, share))}% - 0.17rem)`;
-  axis.bar.classList.toggle("near", share < 0.03 || share > 0.97);
+  axis.bar.classList.toggle("near", near !== "");
 }
 
 // ---- Curves
@@ -238,10 +250,15 @@ function showStatus(status) {
     ["Samples", grouped(status.samples)],
     ["SYNC cycles lost", grouped(status.lost), status.lost > 0],
     ["Missing answers", grouped(status.missing), status.missing > 0],
-    ["Sample rate", running || watching ? `${number(status.rate_hz, 0)} Hz` : "–"],
-    [`Bus load, ${watching ? "measured" : "computed"}`, (running || watching) && loads ? loads : "–"],
-    ["Disk free", status.free_bytes === null ? "–" : `${number(status.free_bytes / 1e9, 1)} GB`],
   ];
+  // What is not known has no card: a dash would say that something is missing.
+  const active = running || watching;
+  if (active && status.rate_hz) {
+    figures.push(["Sample rate", `${number(status.rate_hz, 0)} Hz${status.simulated ? ", simulated" : ""}`]);
+  }
+  if (active && loads) figures.push([`Bus load, ${watching ? "measured" : "computed"}`, loads]);
+  else if (active && status.simulated) figures.push(["Bus load", "none: simulated"]);
+  if (status.free_bytes !== null) figures.push(["Disk free", `${number(status.free_bytes / 1e9, 1)} GB`]);
   // The recorder never waits for this page; the log has what the page missed.
   if (status.dropped > 0) figures.push(["Missed here, in the log", grouped(status.dropped)]);
   const list = byId("figures");
@@ -287,6 +304,18 @@ function showStop(stop) {
   byId("stopped").classList.toggle("good", Boolean(stop.axes_stopped));
 }
 
+const KEPT_LINES = 200;
+const FEW_LINES = 8;  // as many lines of a list are shown at first; the newest are above
+
+// A list that scrolls by itself hides its rest where a browser draws no scroll bar; a button names it.
+function showMore(name) {
+  const list = byId(name), button = byId(`more-${name}`), count = list.children.length;
+  const short = !list.classList.contains("whole");
+  button.hidden = count <= FEW_LINES;
+  button.textContent = short ? `Show all ${count}` : `Show the last ${FEW_LINES}`;
+  [...list.children].forEach((line, index) => { line.hidden = short && index >= FEW_LINES; });
+}
+
 function addEvents(events) {
   for (const event of events) {
     if (event.kind === "move start" || event.kind === "move end") continue;
@@ -297,7 +326,11 @@ function addEvents(events) {
     if (event.remedy) line.append(prose("span", `→ ${event.remedy}`, "remedy"));
     byId(event.alarm ? "alarms" : "events").prepend(line);
   }
-  for (const list of [byId("alarms"), byId("events")]) while (list.children.length > 200) list.lastChild.remove();
+  for (const name of ["alarms", "events"]) {
+    const list = byId(name);
+    while (list.children.length > KEPT_LINES) list.lastChild.remove();
+    showMore(name);
+  }
   byId("faults").hidden = !byId("alarms").children.length;
   byId("quiet").hidden = byId("events").children.length > 0;
 }
@@ -322,7 +355,7 @@ function table(headings, rows) {
 }
 
 function signed(value, digits, unit) {
-  return value === null ? "–" : `${value > 0 ? "+" : ""}${number(value, digits)} ${unit}`;
+  return value === null ? "–" : `${value > 0 ? "+" : ""}${number(value, digits)}\u00a0${unit}`;
 }
 
 function utc(iso) {
@@ -336,7 +369,7 @@ function showResults(found) {
     parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}; error on ${found.gains.error}`));
     parts.push(table(["axis", "gain ± σ", "since nameplate", "error"],
       found.gains.axes.map((one) => [one.axis, `${withDeviation(one.value, one.std)} ${one.unit}`,
-        signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)} %`])));
+        signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)}\u00a0%`])));
   } else parts.push(prose("p", "No calibration yet. After the recordings: `drivegain fit LOG … --out calibration.yaml`"));
   if (found.report) {
     const link = element("a", "Open the report");
@@ -423,6 +456,9 @@ async function begin() {
   stream.onmessage = (event) => take(JSON.parse(event.data));
   stream.onerror = () => { byId("phase").textContent = "The console does not answer; the recording goes on without it."; };
   byId("stop").addEventListener("click", stop);
+  for (const name of ["alarms", "events"]) {
+    byId(`more-${name}`).addEventListener("click", () => { byId(name).classList.toggle("whole"); showMore(name); });
+  }
   byId("span").addEventListener("change", () => { changed = true; });
   window.addEventListener("resize", () => { changed = true; });
   const frame = () => { drawAll(); requestAnimationFrame(frame); };

@@ -13,12 +13,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
+from daq.config.document_kind import IN_ORDER, DocumentKind, kind_of_head, kind_of_tree
 from daq.config.yaml_file import StrictModel, parse_yaml, read_file, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import replace_file
@@ -182,6 +183,8 @@ class CalibrationBody(StrictModel):
 class CalibrationDocument(CalibrationBody):
     """Schema of the whole file; the reader compares the `digests`."""
 
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.CALIBRATION
+
     format: Literal["drivegain-calibration"]
     version: int
     digests: dict[str, str]
@@ -327,10 +330,12 @@ def read_calibration_bytes(path: Path) -> bytes:
 
 def decode_calibration(content: bytes, name: str) -> Calibration:
     """Decode a file's content; `name` is its name in messages. Raises as `load_calibration`."""
+    _require_calibration(name, kind_of_head(content))
     try:
         document = parse_yaml(content, name)
         # Before the schema: in a later version every key may be unknown, and only the version explains it.
         version = document.tree.get("version") if isinstance(document.tree, dict) else None
+        _require_calibration(name, kind_of_tree(document.tree))
         if version != VERSION:
             raise CalibrationUnreadable(
                 name,
@@ -357,6 +362,17 @@ def decode_calibration(content: bytes, name: str) -> Calibration:
         )
     calibration: Calibration = _from_entry(entries)
     return calibration
+
+
+def _require_calibration(name: str, kind: DocumentKind | None) -> None:
+    """Refuse a file of another known kind.
+
+    Raises:
+        CalibrationUnreadable: it is one.
+    """
+    if kind not in (None, DocumentKind.CALIBRATION):
+        expected = f"a calibration of version {VERSION}"
+        raise CalibrationUnreadable(name, found=kind.value, expected=expected, remedy=IN_ORDER)
 
 
 def _digests(body: Mapping[str, object]) -> dict[str, str]:

@@ -27,7 +27,7 @@ from daq.jobs.cell_fit import CalibrationCache, Failure, Loop, Summary, failure_
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 from daq.report.gains import with_deviation
 from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
-from daq.report.text import WholeTable, inert, inert_row, printable, spelled_bytes
+from daq.report.text import Sentence, WholeTable, inert, inert_row, printable, spelled_bytes
 from ident.calibration import Gain
 
 HERE = "127.0.0.1"
@@ -303,7 +303,7 @@ def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
     table.add_column("s", justify="right", no_wrap=True)
     for row in rows:
         if isinstance(row.result, Failure):
-            cells = (printable(f"{row.result.kind}: {row.result.text}"), "", "", "")
+            cells = (printable(f"{row.result.kind}, see below"), "", "", "")
             style = "bold red"
         else:
             cells = _summary_cells(row.result)
@@ -311,7 +311,10 @@ def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
         shown = (*cells[:3], *(cells[3:] if effects else ()), f"{row.seconds:.2f}")
         table.add_row(*map(Text, (printable(row.cell), *shown)), style=style)
     yield table
-    yield from map(printable, _remarks(rows))
+    yield from map(Sentence, _remarks(rows))
+    for row in rows:
+        if isinstance(row.result, Failure):
+            yield Sentence(f"{row.cell}: {row.result.kind}: {row.result.text}", "bold red")
 
 
 def _summary_cells(summary: Summary) -> tuple[str, str, str, str]:

@@ -23,7 +23,7 @@ from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
-from daq.errors import AuditUnusable, reason_of
+from daq.errors import AuditUnusable, counted, reason_of
 from daq.files import follow_links, fsync_folder, read_regular, sha256, sha256_of
 
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
@@ -430,7 +430,8 @@ def judge_chain(content: bytes, digest_now: Callable[[str], str | None], heads: 
     entries = tuple(one for one, _ in chain.decoded if one is not None)
     unknown = sorted(set(heads) - {one.sha256 for one in entries})
     if unknown:
-        says = f"{len(unknown)} entries that were noted elsewhere are missing: {', '.join(h[:12] for h in unknown)}"
+        digests = ", ".join(digest[:12] for digest in unknown)
+        says = f"{counted(len(unknown), 'entry')} noted elsewhere and missing here: {digests}"
         chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
     flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
     return AuditVerdict(

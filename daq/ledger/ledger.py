@@ -351,10 +351,11 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
         )
     cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
     note = f" (if the entries that are missing are of another log, remove {head_file(audit)})" if cut_off else ""
+    places = "1 place that is" if len(verdict.flaws) == 1 else f"{len(verdict.flaws)} places that are"
     more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
     return DataError(
         f"{audit}, line {first.line}",
-        found=f"{len(verdict.flaws)} places that are not what was written{more}\n ",
+        found=f"{places} not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
         remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; until that is "
         "known trust the controller's file by its backups only, and begin another log under a new name "

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit
+from daq.errors import TableUnfit, counted
 from daq.log.bag_file import open_bag
 from daq.log.mcap_bag import JointState, joint_state_from_cdr, unpack_message
 from daq.log.message import JOINTS_SCHEMA
@@ -199,9 +199,11 @@ class _Rows:
             )
         remarks = []
         if len(whole) < len(present):
-            remarks.append(f"{len(present) - len(whole)} stamps at the ends of the bag lack joints and are left out")
+            left_out = counted(len(present) - len(whole), "stamp")
+            remarks.append(f"left out, as joints are missing at the ends of the bag: {left_out}")
         if self._unstamped:
-            remarks.append(f"{self._unstamped} messages have no stamp; the time of their recording is used")
+            unstamped = counted(self._unstamped, "message")
+            remarks.append(f"{unstamped} without a stamp: the time of the recording is used")
         values = np.frombuffer(self._values).reshape(-1, width)[inside]
         clock = stamps_of_ns(self._stamp_ns[inside])
         stamps = None if time is None else clock

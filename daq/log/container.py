@@ -25,6 +25,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
+from daq.config.document_kind import IN_ORDER
+from daq.config.yaml_file import kind_of_file
 from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated, reason_of
 from daq.files import open_regular
 from daq.log.message import (
@@ -195,11 +197,15 @@ class RecordFile:
         start = stream.read(len(MAGIC))
         if start != MAGIC[: len(start)] or (size < len(MAGIC) and size > 0):
             is_text = all(byte in b"\t\n\r" or 0x20 <= byte < 0x7F for byte in start)
+            kind = kind_of_file(self.path)
+            if kind is not None:
+                found = kind.value
+            elif is_text:
+                found = f"a text file that begins with {start.decode()!r}"
+            else:
+                found = f"first bytes {start!r}"
             raise LogForeign(
-                str(self.path),
-                found=f"a text file that begins with {start.decode()!r}" if is_text else f"first bytes {start!r}",
-                expected="a log (MCAP)",
-                remedy="is this the right file? give the files in the order of the command's help",
+                str(self.path), found=found, expected="a log (MCAP)", remedy=f"is this the right file? {IN_ORDER}"
             )
 
     def _check_end(self, stream: BinaryIO, size: int) -> None:

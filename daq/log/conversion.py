@@ -26,6 +26,7 @@ from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
 from ident.model.model import DriveTrain
+from ident.plausible import format_at_limit
 
 _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
@@ -197,11 +198,12 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     limited = samples.statusword & np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16) != 0
     share = limited.mean(axis=0)
     worst = int(np.argmax(share))
-    if share[worst] > LARGEST_SATURATED:
+    largest_percent = 100.0 * LARGEST_SATURATED
+    if 100.0 * share[worst] > largest_percent:
         raise CurrentSaturated(
             f"{log.path}, axis {cell.axes[worst].name}",
-            found=f"a limit active in {100.0 * share[worst]:.1f} % of the samples",
-            expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
+            found=f"a limit active in {format_at_limit(100.0 * share[worst], largest_percent, 1)} % of the samples",
+            expected=f"at most {largest_percent:g} %",
             remedy="plan slower moves, or a smaller payload",
         )
     answered = answers(samples.missing, len(cell.axes))

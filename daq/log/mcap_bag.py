@@ -193,8 +193,10 @@ def foreign_recording(path: Path) -> LogForeign | None:
             if message.topic.has_joint_states:
                 joints = joints or joint_state_from_cdr(unpack_message(message.data)).names
     topics = {topic.name: topic.has_joint_states for topic in bag.topics.values()}
-    if not topics or SAMPLES_TOPIC in topics:
+    if SAMPLES_TOPIC in topics:
         return None
+    if not topics:
+        return _foreign_beginning(path, bag.library)
     states = [topic for topic, has in topics.items() if has]
     found = f"a bag of {bag.library or 'another program'} with " + (
         f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}" if states else ", ".join(topics)
@@ -203,3 +205,19 @@ def foreign_recording(path: Path) -> LogForeign | None:
     if states:
         remedy = "import it: `drivegain import`, with the joints as `columns` (configs/imports/tx40.yaml)"
     return LogForeign(str(path), found=found, expected="a log of drivegain", remedy=remedy)
+
+
+OWN_LIBRARY = "drivegain"  #: Begin of the library's name in logs of ours
+
+
+def _foreign_beginning(path: Path, library: str) -> LogForeign | None:
+    """Return the error for a file that ends before its first message, if another library began it."""
+    if not library or library.startswith(OWN_LIBRARY):
+        return None
+    return LogForeign(
+        str(path),
+        found=f"the begin of a bag of {library}, without a whole message",
+        expected="a log of drivegain",
+        remedy="the copy is incomplete, or its recorder was killed: copy it again, or repair it with `mcap recover`; "
+        f"then `drivegain import` reads bags with {JOINTS_SCHEMA}",
+    )

@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.errors import LogIncomplete, LogUnreadable, UsageError
+from daq.errors import LogIncomplete, LogTruncated, LogUnreadable, UsageError
 from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
@@ -75,10 +75,10 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     reader = LogReader(damaged)
     blocks = reader.until_damage()
     first = next(blocks, None)
+    if first is None and isinstance(reader.damage, LogTruncated):
+        raise _nothing_saved(damaged, f"{reader.damage.found}, and no samples") from reader.damage
     if first is None:
-        raise reader.damage or LogIncomplete(
-            str(damaged), found="no samples", expected="at least one", remedy="record the run again"
-        )
+        raise reader.damage or _nothing_saved(damaged, "no samples")
     head = reader.head
     cell = head.cell(damaged)
     scale = scaling(cell, head.readback)
@@ -153,3 +153,9 @@ def _refuse_running(damaged: Path) -> None:
                 expected="one whose recorder has ended",
                 remedy="wait for its end, or interrupt it with Ctrl-C, which stops the axes",
             ) from error
+
+
+def _nothing_saved(damaged: Path, found: str) -> LogIncomplete:
+    return LogIncomplete(
+        str(damaged), found=found, expected="at least one sample", remedy="nothing can be saved: record the run again"
+    )

@@ -312,12 +312,21 @@ def _verdict(home: CellAxis | None, axis: CellAxis | None, node: FoundNode | Non
     return "profile does not fit" if misfit else "ok"
 
 
+OTHER_DRIVE = (
+    "this is another drive than the cell file describes, and `record` refuses it: check the wiring; if the drive was "
+    "exchanged, enter its `identity` in the cell file and calibrate again"
+)
+
+
 def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
     """Describe what is wrong with a node."""
     if node.shared:
         yield f"found {node.shared}; two devices have this node id, give one of them another"
     if expected is not None and node.identity is not None:
-        yield from expected.differences(node.identity)
+        differing = expected.differences(node.identity)
+        yield from differing
+        if differing:
+            yield OTHER_DRIVE
     yield from node.problems
 
 

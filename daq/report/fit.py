@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from daq.documents.calibration_file import CalibrationBody, as_document
+from daq.errors import counted
 from daq.report import paper_tables
 from daq.report.document import Figure, Report
 from daq.report.effect_names import size_text
@@ -177,6 +179,7 @@ def fit_view(
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
     notes = (
+        *sigma_notes(fitted),
         *geometry_notes(fitted.description, axes),
         *identifiability_notes(fitted, calibration.payload_mass),
         *advice(fitted, needed_verdicts(fitted)),
@@ -189,6 +192,36 @@ def fit_view(
     if found.essential is not None:
         removed = ", ".join(step.name for step in found.essential.removed) or "none"
         yield f"{len(found.essential.system.columns)} essential parameters; removed: {removed}"
+
+
+ROUGH_SIGMA = 0.1  #: Relative deviation of σ itself that is said: of less than fifty moves
+
+
+def sigma_notes(fitted: Fit) -> Iterator[str]:
+    """Say how well σ itself is known, where that is badly: the same plan then gives another σ in each session.
+
+    A variance that is estimated from the scatter of N independent pieces has a relative deviation of √(2/(N − 1)); σ,
+    its root, has half of it.
+    """
+    estimate = fitted.estimate
+    if estimate.gains_fixed or not estimate.method.is_of_currents:
+        return
+    moves = len(fitted.identification.system.clusters)
+    rough = 1.0 / math.sqrt(2.0 * max(moves - 1, 1))
+    if rough <= ROUGH_SIGMA:
+        return
+    apart = "may be quite another"
+    if 2.0 * rough < 1.0:
+        ratio = (1.0 + 2.0 * rough) / (1.0 - 2.0 * rough)
+        if ratio < LARGEST_FACTOR:
+            apart = f"may differ by a factor of {ratio:.1f}"
+    yield (
+        f"σ rests on {counted(moves, 'move')} and is itself known to {100.0 * rough:.0f} % only: that of another "
+        f"recording of the same plan {apart}."
+    )
+
+
+LARGEST_FACTOR = 5.0  #: Between two σ of one plan; beyond, the number means nothing
 
 
 def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudged: Sequence[int] = ()) -> str | None:

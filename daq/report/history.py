@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.config.cell import Cell
-from daq.errors import ControllerUnfit
+from daq.errors import ControllerUnfit, counted
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import head_file
@@ -322,7 +322,9 @@ def history_report(
 def say_verification(found: Verification, console: Console) -> None:
     """Print the state of audit log and history; flaws are in the error."""
     verdict = found.verdict
-    console.print(f"{found.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
+    console.print(
+        f"{found.audit}: {counted(len(verdict.entries), 'entry')}, chain {'unbroken' if verdict.holds else 'BROKEN'}."
+    )
     if not found.noted:
         console.print(
             f"No {head_file(found.audit).name} with the digest of the last entry: whether the end of the audit log is "

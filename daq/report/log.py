@@ -270,10 +270,15 @@ def timing_text(timing: Timing) -> str:
     return f"{'resampled to' if timing.resampled else 'uniform at'} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
 
 
+FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})
+"""Keys that a person has no use for: the offset of two clocks, of which `wall_clock_step_s` has the change."""
+
+
 def log_lines(description: Mapping[str, Any], width: int) -> Iterator[Text]:
     """Lines of a log's description, at most `width` columns wide where words allow it."""
-    indent = max(map(len, description)) + 2
-    for key, value in description.items():
+    shown = {key: value for key, value in description.items() if key not in FOR_PROGRAMS}
+    indent = max(map(len, shown)) + 2
+    for key, value in shown.items():
         text = printable(_readable(value)).replace("\n", " ")
         yield from map(Text, entry_lines(key.replace("_", " "), text, indent, width))
 
@@ -284,7 +289,9 @@ def _readable(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:g}"
+        # An exponent is for programs: 1234567.8 s is 1234568, not 1.23457e+06.
+        whole = f"{value:.0f}"
+        return whole if len(whole) > 6 and abs(value) < 1e15 else f"{value:g}"
     if isinstance(value, dict):
         return ", ".join(f"{key} {_readable(item)}" for key, item in value.items())
     if isinstance(value, list):

@@ -12,8 +12,9 @@ import numpy as np
 from daq.config.cell import Cell, joint_unit
 from daq.report.document import Figure, Report
 from daq.workflow.experiment import Experiment
-from daq.workflow.plan import LONGEST_S, Plan
+from daq.workflow.plan import Plan, longer_run_s
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict, Identifiability, Visibility
+from ident.plausible import format_at_limit
 
 
 class PlannedGain(Report):
@@ -81,7 +82,7 @@ def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
     )
 
 
-def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability) -> Iterator[str]:
+def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability, requested_s: float) -> Iterator[str]:
     """Say which gains are hidden, and what makes weak ones good; σ falls with the square root of the time."""
     hidden = judged.sentences(cell.axis_names)
     yield from hidden
@@ -92,9 +93,12 @@ def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability) -> Iterator[s
     if not weak:
         return
     ways = ["a heavier payload", "wider limits of position, speed and acceleration in the cell file"]
-    seconds = made.duration_s * (max(gain.std_percent for gain in weak) / GOOD_PERCENT) ** 2
-    if seconds <= LONGEST_S:
-        ways.insert(0, f"a longer run (some --duration {10.0 * math.ceil(seconds / 10.0):.0f})")
+    worst_percent = max(gain.std_percent for gain in weak)
+    longer_s = None
+    if math.isfinite(worst_percent):
+        longer_s = longer_run_s(made.duration_s, requested_s, worst_percent / GOOD_PERCENT)
+    if longer_s is not None:
+        ways.insert(0, f"a longer run (some --duration {longer_s:.0f})")
     names = ", ".join(cell.axes[gain.axis].name for gain in weak)
     yield f"For good gains ({GOOD_PERCENT:g} %) of {names}: {'; or '.join(ways)}."
 
@@ -120,9 +124,18 @@ def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
 
 
 def plan_text(
-    out: Path, preview: Path | None, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability
+    out: Path,
+    preview: Path | None,
+    cell: Cell,
+    experiment: Experiment,
+    made: Plan,
+    judged: Identifiability,
+    requested_s: float,
 ) -> str:
-    """Describe a plan in lines for the operator, who looks at its preview, if there is one."""
+    """Describe a plan in lines for the operator, who looks at its preview, if there is one.
+
+    `requested_s` is the duration that the plan was allowed to have [s]; a longer one is proposed for weak gains.
+    """
     look = ", or look at it (--preview PAGE)" if preview is None else f": {preview} shows the moves"
     way = "`record` checks the way to its first target from where the robot stands."
     if cell.clearance is None:
@@ -132,11 +145,11 @@ def plan_text(
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
         f"  {'axis':{width}}  predicted σ  verdict",
         *(
-            f"  {axis.name:{width}}  {gain.std_percent:9.2f} %  {gain.verdict.value}"
+            f"  {axis.name:{width}}  {format_at_limit(gain.std_percent, GOOD_PERCENT, 2):>9} %  {gain.verdict.value}"
             for axis, gain in zip(cell.axes, judged.gains, strict=True)
         ),
         *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged.gains, strict=True)),
-        *_on_all_gains(cell, made, judged),
+        *_on_all_gains(cell, made, judged, requested_s),
         *_assembly(cell, experiment),
         "Assumed:",
         *(f"  {remark}" for remark in experiment.remarks),

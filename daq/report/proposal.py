@@ -124,6 +124,9 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
     console.print(change_table(edit.changes, known, _place(edit)))
     note = noise_note(edit.changes, known, f"the number {_place(edit)}")
     console.print(terminal_text(f"* {note}"), style="dim")
+    judged, sentence = judge(edit.changes, known)
+    if judged and edit.has_effect and not any(change.significant for change in judged.values()):
+        console.print(terminal_text(f"{sentence[0].upper()}{sentence[1:]}. Nothing needs to be written."))
     console.print()
     if isinstance(edit, DriveEdit):
         for change, value in zip(edit.changes, edit.values, strict=True):

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
-from rich.console import RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 
+from daq.errors import counted
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import error_table, identifiability_notes
+from daq.report.fit import error_table, identifiability_notes, sigma_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note
 from daq.report.split_names import names_by_split, placed_by
-from daq.report.text import Sentence, plain_table
+from daq.report.text import Sentence, break_lines, plain_table
 from daq.workflow.fit import Fit
 from ident.calibration import AcceptedEffect, Calibration
 from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
@@ -49,9 +51,12 @@ def residual_view(
     if verbose:
         yield from turns_view(fitted)
         yield from map(Sentence, effect_sizes(calibration))
-    diagnosed = len(fitted.diagnoses)
-    for number, text in enumerate(headline(fitted, account, calibration.effects)):
-        yield Sentence(text, "bold" if number < diagnosed else "")
+    found = headline_of(fitted, account, calibration.effects)
+    axes = len(calibration.gains)
+    if verbose:
+        yield from found.parts()
+    else:
+        yield SentenceScreen(found, max(SCREEN_LINES - axes - AROUND_SENTENCES, FEWEST_SENTENCE_LINES))
     statistics = (*statistical_sentences(fitted, account), *identifiability_notes(fitted, calibration.payload_mass))
     if verbose:
         yield from map(Sentence, statistics)
@@ -59,11 +64,80 @@ def residual_view(
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
     yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
+    yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(
-            f"The report (`--report FOLDER`) and `--verbose` have the search, the errors, and {len(statistics)} "
-            "sentences on what these data can and cannot show."
+            "The report (`--report FOLDER`) and `--verbose` have the search, the errors, and "
+            f"{counted(len(statistics), 'sentence')} on what these data can and cannot show."
         )
+
+
+SCREEN_LINES = 40  #: Largest number of lines of a search on a terminal, whatever was found
+AROUND_SENTENCES = 17
+"""Lines of a terminal of 80 columns besides the sentences and the gains: remarks on the logs, files replaced and
+written, heading of the table and empty lines, how well σ is known, what `--verbose` has, and the next step."""
+FEWEST_SENTENCE_LINES = 10  #: Of a robot with so many axes that their gains alone fill a screen
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """What a search found, in sentences."""
+
+    checks: tuple[str, ...]  #: what is wrong with the recordings or the description, and must be looked at first
+    effects: tuple[str, ...]  #: each accepted effect with its error before and after
+    together: str  #: error of all axes
+    judged: tuple[str, ...]  #: effects that held-out runs do not confirm
+    refused: tuple[str, ...]  #: effects with which `apply` refuses the calibration
+    gains: tuple[str, ...]  #: whether gains have changed
+    ending: tuple[str, ...]  #: time skew, and the verdict of held-out runs
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return all of them, in the order in which they are read."""
+        found = (*self.checks, *self.effects, self.together, *self.judged, *self.refused, *self.gains, *self.ending)
+        return tuple(sentence for sentence in found if sentence)
+
+    def parts(self) -> Iterator[Sentence]:
+        """Return all of them as parts of a view."""
+        for sentence in self.sentences():
+            yield Sentence(sentence, "bold" if sentence in self.checks else "")
+
+    def by_weight(self) -> tuple[str, ...]:
+        """Return them in the order in which a screen gets them: what decides on the calibration comes first."""
+        first = (self.together, *self.refused, *self.checks[:1], *self.ending)
+        ordered = (*first, *self.checks[1:], *self.effects, *self.judged, *self.gains)
+        return tuple(sentence for sentence in ordered if sentence)
+
+
+@dataclass(frozen=True, slots=True)
+class SentenceScreen:
+    """The sentences of a search that fit one screen; the last line counts those that do not."""
+
+    headline: Headline
+    room: int  #: lines for them
+
+    def chosen(self, width: int | None) -> tuple[Sentence, ...]:
+        """Return the sentences that fit, in their order.
+
+        Args:
+            width: columns of the terminal; None of a pipe or file, where a sentence is a line.
+        """
+        left = self.room
+        kept: set[str] = set()
+        for sentence in self.headline.by_weight():
+            lines = 1 if width is None else break_lines(sentence, width).count("\n") + 1
+            if lines <= left or not kept:
+                kept.add(sentence)
+                left -= lines
+        parts = tuple(self.headline.parts())
+        shown = tuple(part for part in parts if part.text in kept)
+        if len(shown) == len(parts):
+            return shown
+        more = counted(len(parts) - len(shown), "sentence")
+        return (*shown, Sentence(f"{more} more: `--verbose` prints them, and the report has them."))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render as many as fit the terminal."""
+        yield from self.chosen(options.max_width if console.is_terminal else None)
 
 
 def effect_sizes(calibration: Calibration) -> Iterator[str]:
@@ -155,11 +229,16 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
 
     The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
+    return headline_of(fitted, account, effects).sentences()
+
+
+def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> Headline:
+    """Return the sentences of `headline` by their subject."""
     kept = fitted.steps[-1].after.effects
-    first = list(diagnosis_texts(fitted.diagnoses))
+    checks = list(diagnosis_texts(fitted.diagnoses))
     if any(is_correction(placed) for placed in kept):
         # Its gains are right, although the cell file is not yet.
-        first.append(
+        checks.append(
             "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
             "Correct the cell file all the same, and fit again."
         )
@@ -176,12 +255,18 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
     judged = tuple(verdict_sentences(fitted))
     if not found:
         none = "No effect is confirmed" if judged else "No structure found"
-        return (*first, f"{none}: the error {where} is {after.total:.1f} %{noise}.", *judged, *ending)
+        together = f"{none}: the error {where} is {after.total:.1f} %{noise}."
+        return Headline(tuple(checks), (), together, judged, (), (), ending)
     change = error_change_text(before.total, after.total)
-    whole = f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}."
-    sentences = (*first, *found, whole, *judged, *_to_be_refused(effects), gains_sentence(fitted, account), *ending)
-    # Of gains that were held there is nothing to say.
-    return tuple(sentence for sentence in sentences if sentence)
+    return Headline(
+        checks=tuple(checks),
+        effects=tuple(found),
+        together=f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}.",
+        judged=judged,
+        refused=tuple(_to_be_refused(effects)),
+        gains=(gains_sentence(fitted, account),),  # empty of gains that were held
+        ending=ending,
+    )
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from textwrap import wrap
@@ -66,9 +67,59 @@ class Sentence:
         """Render as lines that fit the terminal."""
         text = printable(self.text)
         if console.is_terminal:
-            lines = wrap(text, options.max_width, break_long_words=False, break_on_hyphens=False)
-            text = "\n".join(lines)
+            text = break_lines(text, options.max_width)
         yield Text(text, style=self.style)
+
+
+def break_lines(text: str, width: int) -> str:
+    """Break the lines of a text that are longer than a terminal at spaces alone.
+
+    A line that is a command is not broken, and a command in backticks stays on one line where it fits, so that they
+    can be copied. Continued lines of an indented one are indented a little more.
+    """
+    lines: list[str] = []
+    for line in text.split("\n"):
+        if cell_len(line) <= width or _COMMAND_LINE.match(line):
+            lines.append(line)
+            continue
+        indent = len(line) - len(line.lstrip(" "))
+        lines += _broken(_words(line, width), indent, width)
+    return "\n".join(lines)
+
+
+_COMMAND_LINE = re.compile(r"\s*(?:[\w ]+: )?(?:drivegain |--\w)")
+"""Begin of a line that is a command: `Next: drivegain …`, or the options that are to be added to one."""
+_COMMAND_OR_WORD = re.compile(r"[^\s`]*`[^`]*`[^\s`]*|\S+")
+
+
+def _words(line: str, width: int) -> list[str]:
+    """Words of a line; a command in backticks is one, unless it is longer than half a line."""
+    words: list[str] = []
+    for found in _COMMAND_OR_WORD.findall(line):
+        if cell_len(found) > width // 2:
+            words += found.split()
+        else:
+            words.append(found)
+    return words
+
+
+def _broken(words: Sequence[str], indent: int, width: int) -> list[str]:
+    """Lines of words, the first indented, the others by two columns more where it is."""
+    lines: list[str] = []
+    line = " " * indent
+    margin = 0
+    if indent:
+        margin = indent + 2
+    for word in words:
+        is_empty = not line.strip()
+        if not is_empty and cell_len(line) + 1 + cell_len(word) > width:
+            lines.append(line)
+            line = " " * margin + word
+        elif is_empty:
+            line += word
+        else:
+            line += f" {word}"
+    return [*lines, line]
 
 
 class WholeTable(Table):
@@ -85,22 +136,28 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render as one table, as several below each other, or as a paragraph a row: heading and value."""
         free = options.update(width=_UNBOUNDED, min_width=0, max_width=_UNBOUNDED)
-        widths = []
+        room = options.max_width
+        least = []
+        wanted = []
         for column in self.columns:
             measured = [Measurement.get(console, free, value) for value in (column.header, *column.cells)]
-            widths.append(max(one.maximum if column.no_wrap else one.minimum for one in measured))
-        whole = range(len(widths))
-        self.collapse_padding = self.collapse_padding or self._width(whole, widths) > options.max_width
-        if self._width(whole, widths) <= options.max_width:
+            wanted.append(max(one.maximum for one in measured))
+            least.append(wanted[-1] if column.no_wrap else max(one.minimum for one in measured))
+        everything = list(range(len(least)))
+        if self._width(everything, wanted) <= room:
             yield from super().__rich_console__(console, options)
             return
+        self.collapse_padding = self.collapse_padding or self._width(everything, least) > room
+        blocks = [everything]
+        if self._width(everything, least) > room:
+            blocks = self._blocks(least, room)
         if self.title is not None:
             yield self.title
-        blocks = self._blocks(widths, options.max_width)
         for number, block in enumerate(blocks):
             if number:
                 yield ""
-            yield self._only(block)
+            free_width = room - self._width(block, least)
+            yield self._only(block, shared_width(least, wanted, block, free_width))
         if not blocks:
             yield from self._paragraphs(options.max_width)
 
@@ -119,17 +176,12 @@ class WholeTable(Table):
             blocks[-1] = [*blocks[-1], index]
         return blocks
 
-    def _only(self, chosen: list[int]) -> Table:
+    def _only(self, chosen: list[int], widths: list[int]) -> Table:
+        """Return some columns as a table, each of a width in which no word is broken."""
         part = Table(box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding)
         columns = [self.columns[index] for index in chosen]
-        for column in columns:
-            part.add_column(
-                column.header,
-                justify=column.justify,
-                no_wrap=column.no_wrap,
-                overflow=column.overflow,
-                ratio=column.ratio,
-            )
+        for column, width in zip(columns, widths, strict=True):
+            part.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap, width=width)
         cells = zip(*(column.cells for column in columns), strict=True)
         for row, values in zip(self.rows, cells, strict=True):
             part.add_row(*values, style=row.style)
@@ -144,6 +196,29 @@ class WholeTable(Table):
                 yield ""
             for name, value in zip(names, cells, strict=True):
                 yield Text("\n".join(entry_lines(name, str(value), indent, width)), style=row.style or "")
+
+
+def shared_width(least: Sequence[int], wanted: Sequence[int], chosen: Sequence[int], free: int) -> list[int]:
+    """Widths of some columns: their least ones, and a share of what is free in proportion to what they want.
+
+    Args:
+        least: width of each column in which no word is broken.
+        wanted: width of each column in which nothing is broken.
+        chosen: indices of the columns.
+        free: columns of the line that their least widths leave.
+    """
+    missing = [wanted[index] - least[index] for index in chosen]
+    total = sum(missing)
+    given = min(free, total)
+    widths = []
+    for index, need in zip(chosen, missing, strict=True):
+        share = 0
+        if total:
+            share = round(given * need / total)
+        widths.append(least[index] + share)
+        given -= share
+        total -= need
+    return widths
 
 
 _UNBOUNDED, _GAP = 10_000, 3  #: Columns of a line

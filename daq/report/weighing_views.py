@@ -165,8 +165,8 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
         yield ten
         if any(np.isfinite(body.std) & ~body.identifiable):
             yield (
-                f"no beside a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a steel cube "
-                "of this mass has."
+                f"Not identifiable with a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a "
+                "steel cube of the least mass (m − 2 σ) has."
             )
     if not nothing:
         # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.

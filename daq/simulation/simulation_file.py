@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE
 from daq.config.checks import centre_faults, gyration_faults, moment_faults
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import (
     Document,
     Fault,
@@ -70,6 +71,8 @@ class FaultModel(StrictModel):
 
 class ScenarioModel(StrictModel):
     """A whole scenario file."""
+
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.SCENARIO
 
     faults: Annotated[tuple[FaultModel, ...], Field(min_length=1)]
 
@@ -131,6 +134,7 @@ class SimulationModel(StrictModel):
     """A whole simulation file."""
 
     reference: ClassVar[str] = "schemas.md"
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.SIMULATION
 
     urdf: Annotated[str, Field(min_length=1)]
     gravity_m_s2: tuple[float, float, float]

@@ -60,6 +60,7 @@ class JointLimits:
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
 POSTURES = 400
+PAYLOAD = "payload"  #: Name of the capsule of a body that no capsule declares
 ALWAYS = 0.03
 """Two capsules that are apart in a smaller share of random postures belong together, as at a shared joint."""
 
@@ -102,7 +103,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         side = side_of_cube(mass_kg)
         axis = robot.joints[last].axis
         at = robot.mounting_m
-        capsules = (*capsules, Capsule("payload", last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
+        capsules = (*capsules, Capsule(PAYLOAD, last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
     candidates = tuple(
@@ -115,7 +116,11 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
     limits = JointLimits.of(cell)
     postures = np.random.default_rng(0).uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
-    apart = Checker(robot, everything).apart(postures) > ALWAYS
+    # Of a guessed shape, a pair that never keeps the distance belongs together as one that always touches does.
+    is_guessed = [not declared.capsules or capsule.name == PAYLOAD for capsule in capsules]
+    margin_m = [0.5 * declared.minimum_m if guessed else 0.0 for guessed in is_guessed]
+    grown = [replace(one, radius_m=one.radius_m + more_m) for one, more_m in zip(capsules, margin_m, strict=True)]
+    apart = Checker(robot, replace(everything, capsules=tuple(grown))).apart(postures) > ALWAYS
     pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
     together = tuple(
         (capsules[a].name, capsules[b].name) for (a, b), kept in zip(candidates, apart, strict=True) if not kept

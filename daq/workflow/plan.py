@@ -7,23 +7,27 @@ so a proposal costs two small sums and one factorisation; the regressors of a wh
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
     RUNS,
+    CheckedScene,
     Experiment,
     JointLimits,
     PlannedMove,
@@ -37,8 +41,10 @@ from daq.workflow.experiment import (
 from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
-from ident.planning.clearance import CLOSURES, Checker, Obstruction
+from ident.model.robot import Robot
+from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
 from ident.planning.gain_verdict import verdicts
+from ident.plausible import format_at_limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +71,7 @@ THINNING = 2  #: Every second row is enough to compare proposals by
 SHARPNESS = 8.0
 """The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
 MIN_PLANNED_MOVES = 5
+WISHED_MOVES = 30  #: With so many, σ is judged by leaving moves out, and the search has a choice
 MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
 MAX_RETREATS = 30
 MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
@@ -127,7 +134,12 @@ class Search:
                 return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
             most = max(most, moves, key=len)
         found = f"room for {len(most)} moves"
-        raise _unfit(self._cell, self._duration_s, found, "at least 5, better 30", "allow a longer run")
+        if len(most) == 1:  # which only says where the run starts
+            found = "no room for a move"
+        longer_s = _tens(self._duration_s * WISHED_MOVES / max(len(most), 1))
+        expected = f"at least {MIN_PLANNED_MOVES}, better {WISHED_MOVES}"
+        remedy = f"allow a longer run (some --duration {longer_s:.0f})"
+        raise _unfit(self._cell, self._duration_s, found, expected, remedy)
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
         moves = [self._clear_start()]
@@ -297,9 +309,60 @@ class Search:
         return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
 
     def _blocked(self, what: str) -> UsageError:
+        """Error that names the two bodies which are in the way most often."""
         found = f"no clear {what} among hundreds of random ones"
-        remedy = "correct `workspace` and `clearance` in the cell file, or the joint limits"
-        return _unfit(self._cell, self._duration_s, found, "room to move in", remedy)
+        scene = self._experiment.scene
+        checker = scene.checker
+        blocking: list[Obstruction] = []
+        for _ in range(MAX_TRIES):
+            target = np.array(self._random_move().target_rad)
+            obstruction = checker.obstruction(target, target)
+            if obstruction is not None:
+                blocking.append(obstruction)
+        if not blocking:
+            return _unfit(self._cell, self._duration_s, found, "room to move in", "widen the joint limits")
+        pairs = Counter((one.first, one.second) for one in blocking)
+        (worst, times), *_ = pairs.most_common(1)
+        if worst[0] == CLOSURES:
+            remedy = f"correct {_keys(blocking[0])} in the cell file"
+            return _unfit(self._cell, self._duration_s, found, "poses that the loops allow", remedy)
+        farthest_m = max(one.distance_m for one in blocking if (one.first, one.second) == worst)
+        found += f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most {1000.0 * farthest_m:.0f} mm apart"
+        expected = f"at least {1000.0 * checker.scene.minimum_m:.0f} mm"
+        return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
+
+
+def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
+    """Say how two bodies get room, by what the cell file declares of them."""
+    boxes = {box.name for box in scene.checker.scene.boxes}
+    if pair[1] == WORKSPACE_END:
+        return "correct `workspace` in the cell file, or the joint limits"
+    if pair[1] in boxes:
+        return f"correct `{pair[1]}` of `clearance.obstacles` in the cell file, or the joint limits"
+    if scene.guessed:
+        return "the shape of the arm is guessed: declare it in the cell file (`clearance.capsules`)"
+    return "correct these `clearance.capsules` or `clearance.minimum_m` in the cell file, or the joint limits"
+
+
+def _tens(seconds: float) -> float:
+    """Round a duration up to tens of seconds, as a person would give it."""
+    return 10.0 * math.ceil(seconds / 10.0)
+
+
+def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | None:
+    """Duration of a run in which σ is smaller by a ratio [s]; None where it is longer than a plan may be.
+
+    σ falls with the square root of the time.
+
+    Args:
+        used_s: duration of the moves that were found [s].
+        requested_s: duration that they had room for [s]; the longer run is longer than that.
+        ratio: σ that the moves give over σ that is wanted, above 1.
+    """
+    needed_s = _tens(used_s * ratio**2)
+    if needed_s <= requested_s:
+        needed_s = _tens(requested_s + 1.0)
+    return needed_s if needed_s <= LONGEST_S else None
 
 
 def _unfit(cell: Cell, duration_s: float, found: str, expected: str, remedy: str) -> UsageError:
@@ -356,24 +419,70 @@ def plan(
     predicted = experiment.design.std_percent(information)
     found = experiment.design.condition(information)
     worst = int(np.argmax(predicted))
-    remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if not found <= largest_condition:
-        words = f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges"
+        condition = format_at_limit(found, largest_condition, 0)
+        words = f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
+        remedy = _condition_remedy(experiment, duration_s, found / largest_condition)
         raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
+    used_s = experiment_duration_s(cell, draft.moves)
     if not predicted[worst] <= largest_std_percent:
-        words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
+        percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
+        words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
         judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], RUNS)])
-        remedy = ". ".join((remedy, *judged.sentences(cell.axis_names)))
+        ways = ["allow more exchanges, wider joint limits or higher speed"]
+        if np.isfinite(predicted[worst]):
+            longer_s = longer_run_s(used_s, duration_s, float(predicted[worst]) / largest_std_percent)
+            if longer_s is not None:
+                ways.insert(0, f"allow a longer run (some --duration {longer_s:.0f})")
+        remedy = ". ".join(("; or ".join(ways), *judged.sentences(cell.axis_names)))
         raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
     return Plan(
         cell=cell.name,
         seed=seed,
         condition=found,
         predicted_std_percent=tuple(predicted.tolist()),
-        duration_s=experiment_duration_s(cell, draft.moves),
+        duration_s=used_s,
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
     )
+
+
+MADE_BY_MORE_MOVES = 10.0  #: Ratio of two conditions that more moves make; a larger one is of the robot
+
+
+def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -> str:
+    """Say what lowers a condition that is too large by a ratio: more moves, or right angles that are right."""
+    longer_s = _tens(2.0 * duration_s)
+    other = "more exchanges, wider joint limits or higher speed; `--condition` accepts more"
+    if ratio <= MADE_BY_MORE_MOVES and longer_s <= LONGEST_S:
+        return f"allow a longer run (some --duration {longer_s:.0f}), {other}"
+    turned = nearly_right_joints(experiment.design.expectation.model.robot)
+    if not turned:
+        return f"allow {other}"
+    exact = "1.5707963267948966 for a quarter turn, 3.141592653589793 for a half"
+    return (
+        f"the URDF turns {', '.join(turned)} by nearly a right angle, as rounded numbers do (1.5708): parameters that "
+        f"an exact angle hides are nearly invisible then. Write {exact}. If these angles are measured ones, "
+        "`--condition` accepts more"
+    )
+
+
+NEARLY_RIGHT = 2e-3
+"""Largest difference between the entries of a joint's rotation and those of right angles that rounding makes: 3.14 for
+a half turn is off by 1.6e-3."""
+EXACTLY_RIGHT = 1e-9  #: Difference that a double leaves
+
+
+def nearly_right_joints(robot: Robot) -> tuple[str, ...]:
+    """Names of the joints that the URDF turns by nearly, but not exactly, right angles; axes are looked at, too."""
+    found = []
+    for joint in robot.joints:
+        entries = np.concatenate((joint.rotation.ravel(), joint.axis))
+        # Rotations by right angles have entries of 0, 1 and -1 alone.
+        off = np.abs(entries - np.round(entries))
+        if EXACTLY_RIGHT < off.max() < NEARLY_RIGHT:
+            found.append(joint.name)
+    return tuple(found)
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
@@ -408,6 +517,8 @@ class _Move(StrictModel):
 
 
 class _Plan(StrictModel):
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
+
     format: Literal["drivegain-plan"]
     cell: str
     seed: int
@@ -415,6 +526,25 @@ class _Plan(StrictModel):
     # Plans of earlier versions have none.
     predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
+
+
+@dataclass(frozen=True, slots=True)
+class PlanHead:
+    """What a plan file says of itself, its moves unread."""
+
+    cell: str  #: name of the cell it was made for
+    seed: int  #: it was made from
+    predicted_std_percent: tuple[float, ...]  #: of each gain [% of it]; empty in plans of earlier versions
+
+
+def plan_head(path: Path) -> PlanHead:
+    """Read what a plan file says of itself, whatever cell it is for.
+
+    Raises:
+        ConfigurationError: the file is missing, or is no plan.
+    """
+    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
+    return PlanHead(model.cell, model.seed, model.predicted_std_percent)
 
 
 def save_plan(plan: Plan, path: Path) -> None:

@@ -55,12 +55,14 @@ def weigh_logs(
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
-        LogsDiffer: a log is of another cell, or one that should be bare declares a payload.
+        LogsDiffer: a log is of another cell, one that should be bare declares a payload, or the logs with the body
+            declare different ones.
         LogRepeated: a log was given twice: its moves would count twice.
         IdentificationError: see `ident.weigh`.
     """
     reading = _Logs(calibration, cell)
     loaded = [reading.load(log) for log in logs]
+    _require_one_body(logs, loaded)
     without = []
     for log in bare:
         run = reading.load(log)
@@ -87,6 +89,26 @@ def weigh_logs(
     masses = {None if run.payload is None else run.payload.known.get("m") for run in loaded}
     declared_kg = masses.pop() if len(masses) == 1 else None
     return Weighed(described, tuple(logs), tuple(bare), body, help_, declared_kg, fitted)
+
+
+def _require_one_body(logs: Sequence[Path], runs: Sequence[Run]) -> None:
+    """Refuse logs that declare different payloads: one body is weighed, mounted one way."""
+    declared = [_declared(run) for run in runs]
+    for log, text in zip(logs, declared, strict=True):
+        if text != declared[0]:
+            raise LogsDiffer(
+                str(log),
+                found=f"{text}, and {declared[0]} in {logs[0]}",
+                expected="logs with one body, mounted one way",
+                remedy="weigh each body by itself; give logs without load with --bare",
+            )
+
+
+def _declared(run: Run) -> str:
+    """Name what a run declares to be mounted."""
+    if run.payload is None:
+        return "no load"
+    return f"payload {run.payload.name!r} in mounting {run.payload.mounting!r}"
 
 
 def contact_in(

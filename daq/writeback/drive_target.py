@@ -14,14 +14,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
+from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import StrictModel
-from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.fold import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
@@ -43,7 +44,7 @@ class DriveNote(StrictModel):
     axis: str  #: name of the axis
     node_id: Annotated[int, Field(ge=1, le=127)]  #: its node id
     vendor_id: _U32  #: vendor that the drive reported (1018h:1)
-    product_code: _U32  #: product (1018h:2)
+    product_code: _U32 | None  #: product (1018h:2)
     serial: _U32 | None  #: serial number (1018h:4)
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: index of the object that was to be written
     subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: its subindex
@@ -59,6 +60,8 @@ class DriveNote(StrictModel):
 
 class DriveRecord(StrictModel):
     """One write to the drives of a cell."""
+
+    document_kind: ClassVar[DocumentKind | None] = DocumentKind.DRIVE_RECORD
 
     format: Literal["drivegain drive record 1"]
     cell: str  #: name of the cell
@@ -254,7 +257,7 @@ class DriveTarget:
             )
         raise CalibrationRefused(
             self.subject,
-            found=f"{len(paths)} records of the present values" if paths else f"no record in {folder}",
+            found=f"{counted(len(paths), 'record')} of the present values" if paths else f"no record in {folder}",
             expected="the record of a write that changed them",
             remedy="nothing was written",
         )

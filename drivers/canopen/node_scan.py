@@ -127,8 +127,11 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Read object 1018h; the serial is None where a node has none."""
-    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), access.read_optional(SERIAL, any_abort=True))
+    """Read object 1018h; product code and serial are None where a node has none (CiA 301 requires the vendor only)."""
+    vendor_id = access.read(VENDOR_ID)
+    product_code = access.read_optional(PRODUCT_CODE, any_abort=True)
+    serial = access.read_optional(SERIAL, any_abort=True)
+    return Identity(vendor_id, product_code, serial)
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:

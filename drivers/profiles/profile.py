@@ -193,24 +193,30 @@ CIA402 = DriveProfile(
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Object 1018h (CiA 301); a serial of None is not compared."""
+    """Object 1018h (CiA 301).
+
+    The vendor alone is mandatory. None stands for a field that a drive does not have, or that a configuration leaves
+    open.
+    """
 
     vendor_id: int
-    product_code: int
+    product_code: int | None = None
     serial: int | None = None
 
     def differences(self, found: Identity) -> tuple[str, ...]:
-        """Describe each field in which a drive differs from this configuration."""
+        """Describe each field in which a drive differs from this configuration; a serial number is decimal."""
         fields = (
-            ("vendor id 1018h:01", self.vendor_id, found.vendor_id),
-            ("product code 1018h:02", self.product_code, found.product_code),
-            ("serial number 1018h:04", self.serial, found.serial or 0),
+            ("vendor id 1018h:01", "#x", self.vendor_id, found.vendor_id),
+            ("product code 1018h:02", "#x", self.product_code, found.product_code),
+            ("serial number 1018h:04", "d", self.serial, found.serial),
         )
-        return tuple(
-            f"{name} is {have:#x}, the cell configuration expects {want:#x}"
-            for name, want, have in fields
-            if want is not None and want != have
-        )
+        described = []
+        for name, notation, expected, reported in fields:
+            if expected is None or expected == reported:
+                continue
+            number = "not reported" if reported is None else format(reported, notation)
+            described.append(f"{name} is {number}, the cell configuration expects {expected:{notation}}")
+        return tuple(described)
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,7 +100,8 @@ def _judged(
     """The model with those effects that held-out runs confirm; `verdicts` is given what they say of each."""
     current = found
     while len(current.effects) > current.declared:
-        progress(f"judging {len(current.effects) - current.declared} effects on held-out runs")
+        searched = len(current.effects) - current.declared
+        progress(f"judging {searched} {'effect' if searched == 1 else 'effects'} on held-out runs")
         judged = [_verdict(start, current, placed) for placed in current.effects[current.declared :]]
         verdicts |= {one.placed: one for one in judged}
         leaving = _leaving(judged, write_undecided=write_undecided)

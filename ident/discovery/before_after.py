@@ -336,7 +336,8 @@ def account(
     weights_nm_a = start.estimate.gains
 
     def assessed(evidence: Evidence) -> Assessment:
-        progress(f"errors with {len(evidence.effects)} effects in the model")
+        count = len(evidence.effects)
+        progress(f"errors with {count} {'effect' if count == 1 else 'effects'} in the model")
         return assess(evidence, weights_nm_a, left_out_runs(evidence, weights_nm_a) if leave_out_runs else None)
 
     first = last = assessed(start)

@@ -182,9 +182,15 @@ class TurnedGeometry:
                 "controller, and fit again: nothing else is judged until it is right",
             )
         if reading.axis in self.reversed_currents:
-            remedy = "reverse the axis of this joint in the URDF, or the signs of both its position and its current"
+            remedy = (
+                f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, its row of "
+                "`drive_train.ratio` (`lead_mm` of a prismatic axis) and the sign of its nameplate gain"
+            )
         else:
-            remedy = "reverse the sign of its position, not of its current, in the cell or the import"
+            remedy = (
+                f"reverse the row of {name} in `drive_train.ratio` of the cell file (`lead_mm` of a prismatic axis), "
+                "and leave its nameplate gain; of an import with `side: joint`, the sign of its position in the file"
+            )
         return Diagnosis(
             POSITION_REVERSED,
             runs,

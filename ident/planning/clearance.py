@@ -67,6 +67,7 @@ class Obstruction:
 
 
 CLOSURES = "the closures"  #: What is in the way where the loops of a closed chain do not close, or are nearly singular
+WORKSPACE_END = "the end of the workspace"  #: What is in the way of a body that must not leave the workspace
 LARGEST_PLANNED_CONDITION = 60.0
 """Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
 LARGEST_PLANNED_MISFIT = 0.01
@@ -176,7 +177,7 @@ class Checker:
                     first, second = (self._names[index] for index in self._pairs[row])
                     return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
                 confined = self.scene.capsules[self._confined[row - len(self._pairs)]]
-                return Obstruction(confined.name, "the end of the workspace", margin_m, where)
+                return Obstruction(confined.name, WORKSPACE_END, margin_m, where)
             half /= 2.0
             open_ = middles[unsure.any(axis=0)]
             middles = np.concatenate((open_ - half, open_ + half))
@@ -231,7 +232,7 @@ class Checker:
         if row < len(self._pairs):
             first, second = self._pairs[row]
             return self._names[first], self._names[second]
-        return self.scene.capsules[self._confined[row - len(self._pairs)]].name, "the end of the workspace"
+        return self.scene.capsules[self._confined[row - len(self._pairs)]].name, WORKSPACE_END
 
     def _placed(self, joints: FloatArray) -> FloatArray:
         """Both ends of every body in each posture, shape (bodies, k, 3, 2)."""

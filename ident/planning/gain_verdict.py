@@ -23,6 +23,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.model.robot import Motion
 from ident.planning.excitation import UNSEEN_PERCENT, Design, Excitation
+from ident.plausible import format_at_limit
 
 GOOD_PERCENT = 1.0  #: Largest standard deviation of a good gain: drives are sold with gains known to some percent
 SHARE_OF_BEST = 3.0  #: A source counts when it alone gives at most so many times the deviation of the best one
@@ -110,12 +111,14 @@ class GainVerdict:
         only = "only " if len(self.sources) == 1 or not self.gravity_acts else ""
         text = f"{axis_name} is not identifiable"
         if self.sources and np.isfinite(self.std_percent):
-            text = f"{axis_name} is identifiable {only}through {through}: σ {self.std_percent:.2g} %"
+            std_percent = format_at_limit(self.std_percent, GOOD_PERCENT, 2, "g")
+            text = f"{axis_name} is identifiable {only}through {through}: σ {std_percent} %"
         if self.hidden_by is Hidden.PRELOAD:
             text += f", {self.known_preload_percent:.2g} % if internal preload were known"
         if self.advice is None:
             return text
-        return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {self.advice.std_percent:.2g} %)"
+        improved_percent = format_at_limit(self.advice.std_percent, GOOD_PERCENT, 2, "g")
+        return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {improved_percent} %)"
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,15 @@ def test_files_named_in_the_documentation_exist() -> None:
     assert named > 20
 
 
+def test_the_first_commands_of_a_page_come_after_the_path_that_they_need() -> None:
+    """A reader who types the page from its beginning has no `drivegain` before."""
+    for page in ("README.md", "docs/tutorial/guide.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        first = re.search(r"^(\$ )?drivegain \w", text, re.MULTILINE)
+        assert first is not None, page
+        assert 'export PATH="$PWD/.venv/bin:$PATH"' in text[: first.start()], page
+
+
 def test_every_page_is_in_the_navigation() -> None:
     toctrees = "\n".join(
         block for page in PAGES for block in re.findall(r"```\{toctree\}(.*?)```", page.read_text(), re.DOTALL)

@@ -10,7 +10,7 @@ from daq.advice import COMMANDS, for_command_line
 from daq.cli.failure import ErrorParts
 from drivers.canopen.emcy import remedy_of
 from drivers.errors import NodeMisplaced, ParametersMixed
-from ident.errors import PayloadMissing
+from ident.errors import PayloadMissing, PayloadUnseen
 from ident.estimators.diagnosis import REMEDIES_OF_DISAGREEMENT
 from ident.estimators.method import Method
 
@@ -46,3 +46,9 @@ def test_a_misplaced_node_names_the_scan() -> None:
 
 def test_mixed_parameters_name_the_rollback() -> None:
     assert "`drivegain rollback CELL --drives`" in ErrorParts.of(ParametersMixed(("J1",), ("J2: silent",))).do
+
+
+def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_one_is_advised() -> None:
+    """A body that was mounted in the run without load hides it as well as a light one does."""
+    remedy = ErrorParts.of(PayloadUnseen((40.0, 60.0), ("bare", "loaded"))).do
+    assert remedy.index("what was mounted in each run") < remedy.index("a heavier payload")

@@ -18,7 +18,7 @@ from tests.faults.cells import run
 
 REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
     FaultKind.SILENT: (NodeMissing, r"J2 \(node 2\) did not answer within 1 s \(answered: 1, 3, 4, 5, 6\)"),
-    FaultKind.OTHER_SERIAL: (SetupRefused, r"J2 \(node 2\): serial number 1018h:04 is 0x3eb, .* expects 0x3ea"),
+    FaultKind.OTHER_SERIAL: (SetupRefused, r"J2 \(node 2\): serial number 1018h:04 is 1003, .* expects 1002"),
     FaultKind.REFUSES_NMT: (
         StateRefused,
         r"J2 \(node 2\): asked for NMT OPERATIONAL, its heartbeat still says PRE-OPERATIONAL",

@@ -17,7 +17,7 @@ from ident.model.bodies import LINK_PARAMETERS, Payload, body_of
 from ident.model.robot import Motion, Place
 from ident.planning.excitation import Excitation
 from ident.planning.gain_verdict import ExtraMoves
-from ident.weighing import RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
+from ident.weighing import KNOWN, RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
 from tests.ident.recordings import FloatArray, Truth
 from tests.ident.weighed import AXIS, WeighedCell, a_body, noisy_run, weighed_cell
 
@@ -223,3 +223,22 @@ def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_l
     assert 2.0 * 0.02 > 5.0 * (5.0 / 7850.0) ** (2.0 / 3.0)
     assert identified(0.02) == ["Izz", "mx", "my", "m"]  # my is near zero, and known to less than the cube's
     assert identified(0.2) == ["mx", "my", "m"]
+
+
+@given(mass_kg=st.floats(0.1, 200.0), share=st.floats(0.0, 3.0))
+def test_a_mass_is_identified_to_a_tenth_of_itself_and_nothing_is_small_beside_an_unknown_one(
+    mass_kg: float, share: float
+) -> None:
+    """±41 % of a mass were called identified, as twice σ is less than the mass."""
+    ten = np.full(10, 1e-9)
+    ten[9] = mass_kg
+    std = np.full(10, 1e-4 * mass_kg)
+    std[9] = share * mass_kg
+    covariance = np.diag(std**2)
+    body = WeighedBody(ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale))
+    known = body.identifiable
+    assert known[9] == (share <= KNOWN)
+    least = body.size
+    assert known[:9].tolist() == (2.0 * std < least)[:9].tolist()
+    if share > 0.5:
+        assert not known.any()

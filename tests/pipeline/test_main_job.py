@@ -160,7 +160,7 @@ def test_residual_prints_one_screen(
     assert "J3 has friction that grows with the load: the error of J3 on held-out runs falls from" in text
     assert "Drive gains with the effects" in text
     assert f"Written: {demonstration / 'again.yaml'}" in text
-    assert next_step(progress.splitlines()[-1]) == "validate"
+    assert next_step(progress.splitlines()[-1]) == "apply"
 
 
 @pytest.fixture(scope="module")

@@ -54,6 +54,8 @@ def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
         assert main(fit) == ExitCode.OK
     said = capsys.readouterr()
     assert f"Written: {report}/" in said.out
+    for file in (out, report / "report.html"):
+        assert said.err.count(f"Replaced: {file} (of") == 1
     assert next_step(said.err.splitlines()[-1]) == "residual"
     assert "--gains fixed" in said.err.splitlines()[-1]
     page = (report / "report.html").read_text()

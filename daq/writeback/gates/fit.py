@@ -12,6 +12,7 @@ from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
 from ident.errors import Diagnosis
+from ident.plausible import format_at_limit
 
 NOISE = 1.01
 AXIS_NOISE = 1.02
@@ -113,16 +114,17 @@ def error(context: GateContext) -> Iterator[GateFinding]:
     if not judged.total <= policy.max_error_percent:
         yield (
             "calibration",
-            f"a relative error of {judged.total:.1f} % of the torques",
+            f"a relative error of {format_at_limit(judged.total, policy.max_error_percent, 1)} % of the torques",
             f"at most {policy.max_error_percent:g} %",
             "the model does not describe this robot: check drive train, roles, payload and units",
         )
     names = context.axis_names
     for name, number in zip(names, judged.axes, strict=False):
         if number > policy.max_axis_error_percent:
+            percent = format_at_limit(number, policy.max_axis_error_percent, 1)
             yield (
                 name,
-                f"a relative error of {number:.1f} % of this axis's torque",
+                f"a relative error of {percent} % of this axis's torque",
                 f"at most {policy.max_axis_error_percent:g} %",
                 "the model does not describe this axis: check its drive train, drive, current and direction",
             )

@@ -11,6 +11,7 @@ from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Source
 from ident.data.run import Recording
+from ident.plausible import format_at_limit
 
 _FIT = "fit"
 _HOLDOUT = "holdout"
@@ -194,7 +195,7 @@ def saturation(context: GateContext) -> Iterator[GateFinding]:
             if percent > bound:
                 yield (
                     f"{name}, axis {axis}",
-                    f"a limit acting in {percent:.1f} % of the samples",
+                    f"a limit acting in {format_at_limit(percent, bound, 1)} % of the samples",
                     f"at most {bound:g} %",
                     "record slower moves (`record --speed`), or a smaller payload",
                 )

@@ -7,11 +7,12 @@ import unicodedata
 from collections.abc import Iterator
 
 from daq.config.cell import CellAxis
-from daq.errors import SignatureInvalid
+from daq.errors import SignatureInvalid, counted
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GainChange, GateFinding, parse_base, short_digest
 from daq.writeback.signature import signers_of
 from ident.calibration import Gain
+from ident.plausible import format_at_limit
 
 _SPELLING = 1e-9  #: Two spellings of one number are one number
 _CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass"
@@ -39,7 +40,10 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
     for change in _finite_changes(context):
         if not change.std_percent <= bound:
             remedy = "record longer or more exciting moves, or a heavier payload"
-            yield change.axis, f"σ {change.std_percent:.2f} %", f"at most {bound:g} %", remedy
+            if not context.calibration.effects:
+                remedy = f"look for what the model lacks with `drivegain residual`, as it is in σ; or {remedy}"
+            found = f"σ {format_at_limit(change.std_percent, bound, 2)} %"
+            yield change.axis, found, f"at most {bound:g} %", remedy
 
 
 def same_sign(context: GateContext) -> Iterator[GateFinding]:
@@ -59,11 +63,13 @@ def change_bound(context: GateContext) -> Iterator[GateFinding]:
     policy = context.policy
     for change in filter(_keeps_sign, _finite_changes(context)):
         if not abs(change.change_percent) <= policy.max_change_percent:
-            found = f"a change of {change.change_percent:+.1f} % from the gain now"
+            percent = format_at_limit(change.change_percent, policy.max_change_percent, 1, "+f")
+            found = f"a change of {percent} % from the gain now"
             yield change.axis, found, f"at most ±{policy.max_change_percent:g} %", _CURRENT_SCALE
         bound = policy.max_change.get(change.axis)
         if bound is not None and not abs(change.new - change.old) <= bound:
-            found = f"a change of {change.new - change.old:+.4g} {change.unit} from the gain now"
+            difference = format_at_limit(change.new - change.old, bound, 4, "+g")
+            found = f"a change of {difference} {change.unit} from the gain now"
             yield change.axis, found, f"at most ±{bound:g} {change.unit}", _CURRENT_SCALE
 
 
@@ -74,7 +80,7 @@ def nameplate_bound(context: GateContext) -> Iterator[GateFinding]:
         if not abs(change.nameplate_percent) <= bound:
             yield (
                 change.axis,
-                f"{change.nameplate_percent:+.1f} % from the nameplate",
+                f"{format_at_limit(change.nameplate_percent, bound, 1, '+f')} % from the nameplate",
                 f"at most ±{bound:g} %",
                 "check the drive profile, the nameplate gain and the payload's mass",
             )
@@ -181,7 +187,7 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
         may = ", ".join(_others(tuple(policy.signers), applying)) or "no one else"
         yield (
             subject,
-            f"{len(others)} signatures ({', '.join(others) or 'none'}), not counting the operator's",
+            f"{counted(len(others), 'signature')} ({', '.join(others) or 'none'}), not counting the operator's",
             f"{policy.signatures} of: {may}",
             "have them review the calibration and sign it with `drivegain sign`",
         )

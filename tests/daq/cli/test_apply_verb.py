@@ -87,9 +87,10 @@ def bench(tmp_path: Path) -> Bench:
     ("order", "words"),
     [
         (("cell", "controller"), ("controllers/demo.yaml", "no calibration", "`drivegain fit` wrote")),
+        (("cell", "cell"), ("cell.yaml", "found:    a cell file", "expected: a calibration of version")),
         (
             ("calibration", "cell"),
-            ("calibration.yaml", "file of another kind, with format, version", "CELL comes first"),
+            ("calibration.yaml", "found:    a calibration", "expected: a cell file", "CELL comes first"),
         ),
         (("controller", "calibration"), ("demo.yaml", "file of another kind, with controller", "CELL comes first")),
         (
@@ -412,7 +413,14 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01)
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
     assert bench.apply() == ExitCode.OK
-    assert "σ of both" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "σ of both" in shown
+    assert "No gain has changed by more than noise: the largest change is J4 +1.5 % (" in shown
+    assert "Nothing needs to be written." in shown
+    far = replace(gain, value=gain.value * 1.1)
+    save_calibration(replace(known, gains=(*known.gains[:3], far, *known.gains[4:])), bench.calibration)
+    assert bench.apply() == ExitCode.OK
+    assert "Nothing needs to be written" not in capsys.readouterr().out
 
 
 def _shown_base(shown: str) -> str:

@@ -18,7 +18,6 @@ from rich.console import Console
 
 from daq.cli import main
 from daq.cli.app import ALIASES, BY_JOB, VERBS
-from daq.cli.plan import free_name
 from daq.cli.terminal import say_written, show_steps
 from daq.cli.verb import Job, Verb, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
@@ -125,11 +124,30 @@ def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
     assert main(["scan", "missing.yaml"]) == ExitCode.CONFIGURATION
 
 
-def test_a_plan_names_a_log_that_is_not_there_yet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("unloaded.mcap", "held-out.mcap", "run-3.mcap", "run-4.mcap"):
-        assert free_name() == name
-        Path(name).touch()
+@pytest.mark.parametrize("verb", VERBS, ids=[verb.name for verb in VERBS])
+def test_an_option_without_its_value_is_an_error_of_the_usual_form(
+    verb: Verb, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """For every option that takes one, as a person and as a program see it."""
+    for one in verb.kinds or (verb,):
+        names = [verb.name]
+        parsed = verb.command()
+        if verb.kinds:
+            names.append(one.name)
+            parsed = parsed.commands[one.name]
+        options = [param for param in parsed.params if param.param_type_name == "option" and not param.is_flag]
+        takes_json = any("--json" in param.opts for param in parsed.params)
+        for option in (max(param.opts, key=len) for param in options):
+            assert main([*names, option]) == ExitCode.USAGE
+            said = capsys.readouterr().err
+            assert all(f"{label}:" in said for label in ("error", "found", "expected", "do"))
+            assert option in said
+            if takes_json:
+                assert main([*names, "--json", option]) == ExitCode.USAGE
+                failure = json.loads(capsys.readouterr().err)
+                assert (failure["kind"], failure["exit_code"]) == ("UsageError", ExitCode.USAGE)
+                assert option in failure["found"]
+                assert failure["do"] == f"`drivegain {verb.name} --help` explains it"
 
 
 def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:

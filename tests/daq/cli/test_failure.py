@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from daq.cli.app import main
-from daq.cli.failure import ADVICE, ErrorParts, show_failure
+from daq.cli.failure import ADVICE, ADVICE_WITHIN, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
 from daq.report.document import ErrorReport, json_tree
 from drivers.canopen.bus import bus_errors
@@ -44,8 +44,23 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
     assert all(label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do"))
 
 
+@pytest.mark.parametrize("verb", ["scan", "monitor"])
+@pytest.mark.parametrize("kind", [*_all(DriverError)], ids=lambda kind: kind.__name__)
+def test_no_verb_that_asks_the_drives_advises_to_run_itself(kind: type[Exception], verb: str) -> None:
+    error = kind.__new__(kind)
+    error.args = ("J3 (node 3): evidence",)
+    for name in ("address", "found", "remedy"):
+        object.__setattr__(error, name, "")
+    failure = ErrorParts.of(error, verb)
+    assert failure.do
+    own = re.findall(rf"`drivegain {verb} CELL([^`]*)`", failure.do)
+    # An option that was not given would be another command.
+    assert all("--" in options for options in own), failure.do
+
+
 def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
-    for expected, remedy in ADVICE.values():
+    advice = [*ADVICE.values(), *(one for within in ADVICE_WITHIN.values() for one in within.values())]
+    for expected, remedy in advice:
         for verb, rest in re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}"):
             assert main([verb, "--help"]) == 0
             text = capsys.readouterr().out

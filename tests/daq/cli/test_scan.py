@@ -24,7 +24,7 @@ from daq.config.cell_buses import bus_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
 from daq.log.reader import read_log
-from daq.report.bus_views import scan_report, scan_table, scan_view, scanned_nodes
+from daq.report.bus_views import OTHER_DRIVE, scan_report, scan_table, scan_view, scanned_nodes
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
@@ -101,6 +101,20 @@ def test_a_virtual_bus_without_a_cell_names_the_simulation(checkout: Path, capsy
     assert "wiring" not in said
 
 
+def test_a_scan_without_answers_does_not_advise_a_scan(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    file.write_text(file.read_text().replace("node_id: 6", "node_id: 66"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus):
+        assert main(["scan", str(file), "--json"]) == ExitCode.DEVICE_FAULT
+    failure = json.loads(capsys.readouterr().err)
+    assert failure["kind"] == "NodeMissing"
+    assert "wiring and termination" in failure["do"]
+    assert "drivegain scan" not in failure["do"]
+
+
 def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
     real = replace(cell, buses=(replace(cell.buses[0], interface="socketcan"),))
     axes = drive_axes(real)
@@ -118,7 +132,38 @@ def test_a_message_names_the_axis_first(cell: Cell) -> None:
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
     (row, *_) = scanned_nodes(cell, (_node(1, 0x237, serial=9),), "demo")
     assert (row.verdict, row.enabled) == ("other serial number", True)
-    assert row.remarks == ["serial number 1018h:04 is 0x9, the cell configuration expects 0x3e9"]
+    assert row.remarks == ["serial number 1018h:04 is 9, the cell configuration expects 1001", OTHER_DRIVE]
+
+
+def test_table_and_remarks_write_the_numbers_of_an_identity_alike(cell: Cell) -> None:
+    other = FoundNode(1, Identity(0x2, 0x3, 4), 1, "drive", 0x7F, 0x250)
+    rows = scanned_nodes(cell, (other,), "demo")
+    cells = _shown(cell, (other,), 200).split()
+    for number, expected in (("0x2", "0x29a"), ("0x3", "0x40200"), ("4", "1001")):
+        assert number in cells
+        assert any(f"is {number}, the cell configuration expects {expected}" in remark for remark in rows[0].remarks)
+
+
+def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cell: Cell) -> None:
+    silent = FoundNode(1, Identity(0x29A, None, None), 1, "drive", 0x7F, 0x250)
+    (row, *_) = scanned_nodes(cell, (silent,), "demo")
+    assert row.verdict == "other product code"
+    assert row.remarks[:2] == [
+        "product code 1018h:02 is not reported, the cell configuration expects 0x40200",
+        "serial number 1018h:04 is not reported, the cell configuration expects 1001",
+    ]
+
+
+@pytest.mark.parametrize("identity", [None, Identity(0x29A), Identity(0x29A, None, 1001), Identity(0x29A, 0x40200)])
+@pytest.mark.parametrize("reported", [Identity(0x29A, 0x40200, 1001), Identity(0x29A, None, 1001)])
+def test_a_field_that_is_left_out_of_an_identity_is_not_compared(
+    cell: Cell, identity: Identity | None, reported: Identity
+) -> None:
+    axes = (replace(cell.axes[0], identity=identity), *cell.axes[1:])
+    node = FoundNode(1, reported, 1, "drive", 0x7F, 0x250)
+    (row, *_) = scanned_nodes(replace(cell, axes=axes), (node,), "demo")
+    product_missing = identity == Identity(0x29A, 0x40200) and reported.product_code is None
+    assert row.verdict == ("other product code" if product_missing else "ok")
 
 
 def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
@@ -157,6 +202,42 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
     assert [row["verdict"] for row in rows] == ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
     (remark,) = rows[2]["remarks"]
     assert "no object 6075h:00 (scale of the current)" in remark
+
+
+def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_serial(
+    checkout: Path,
+    cell: Cell,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    declared = file.read_text()
+    vendor_alone = declared.replace(", product_code: 0x00040200, serial: 1005", "")
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
+    ):
+        server = simulated.nodes[4]._sdo
+        complete = server._read
+
+        def read(index: int, subindex: int) -> bytes:
+            if index == 0x1018 and subindex > 1:
+                raise SdoAbort(0x06090011)
+            return complete(index, subindex)
+
+        monkeypatch.setattr(server, "_read", read)
+        file.write_text(vendor_alone)
+        assert main(["scan", str(file)]) == ExitCode.OK
+        assert "Next: drivegain plan" in capsys.readouterr().err
+        file.write_text(declared)
+        # The scan has done its work: the exit code stays, and the text says that `record` will refuse.
+        assert main(["scan", str(file)]) == ExitCode.OK
+        shown = capsys.readouterr()
+    assert "J5 (node 5): serial number 1018h:04 is not reported" in shown.out
+    assert f"J5 (node 5): {OTHER_DRIVE}" in shown.out
+    assert "Next" not in shown.err
 
 
 def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:

@@ -70,6 +70,17 @@ def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
         drive_axes(cell)
 
 
+@pytest.mark.parametrize("kept", ["", "    identity: {vendor_id: 1}\n", "    identity: {vendor_id: 1, serial: 2}\n"])
+def test_an_axis_may_leave_its_identity_open_or_a_part_of_it(configurations: Path, kept: str) -> None:
+    path = configurations / "cells/demo.yaml"
+    text = path.read_text()
+    path.write_text(re.sub(r"    identity: .*\n", kept, text))
+    assert path.read_text() != text
+    identity = drive_axes(load_cell(path))[0].identity
+    assert (identity is None) == (kept == "")
+    assert identity is None or identity.product_code is None
+
+
 def test_limits_in_rad_are_recognised_without_limits_in_the_urdf(configurations: Path) -> None:
     """On continuous joints no number of the URDF gives the unit away, but no axis can move more than a few degrees."""
     urdf, path = configurations / "robots/tx40.urdf", configurations / "cells/demo.yaml"

@@ -187,6 +187,10 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         for words in ("7305h", "check the plugs and cables of encoder", "The axes are stopped", "ended early"):
             assert words in body, words
         assert "INVALID" not in body  # it never came to an end that could be judged
+        for figure in ("Bus load", "Sample rate"):  # of a run that has ended there is none
+            assert figure not in body
+        assert "–\n" not in made.page.inner_text("#figures")
+        _events_can_be_seen(made.page)
         _pictures(made, browser, checkout)
         assert made.refused == []
 
@@ -254,6 +258,59 @@ def test_a_preview_is_a_right_handed_view_from_above(tmp_path: Path, checkout: P
     assert faults == []
 
 
+def _events_can_be_seen(page: Page) -> None:
+    """No line of the events is cut: a few are shown, and a button has the others."""
+    count = page.evaluate("document.querySelectorAll('#events li').length")
+    visible = "[...document.querySelectorAll('#events li')].filter((one) => one.checkVisibility()).length"
+    assert page.evaluate(visible) == 8 < count
+    list_ = "document.querySelector('#events')"
+    assert page.evaluate(f"{list_}.scrollHeight <= {list_}.clientHeight")
+    assert page.inner_text("#more-events") == f"Show all {count}"
+    page.click("#more-events")
+    assert page.evaluate(visible) == count
+    assert page.evaluate(f"{list_}.scrollHeight <= {list_}.clientHeight")
+    page.click("#more-events")
+    assert page.evaluate(visible) == 8
+    page.evaluate("window.scrollTo(0, 0)")
+
+
+def test_a_bar_is_red_for_a_reason(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+    with rig(tmp_path, checkout, browser) as made:
+        texts = {
+            share: made.page.evaluate(
+                """(share) => {
+                    const status = {axes: [{state: "FAULT", position: -170 + share * 340, current: 0}]};
+                    window.drivegain.showAxis(0, status);
+                    const card = document.querySelector("#axes article");
+                    return [card.querySelector(".values").textContent,
+                            card.querySelector(".bar").classList.contains("near")];
+                }""",
+                share,
+            )
+            for share in (-0.01, 0.01, 0.5, 0.99, 1.01)
+        }
+    said = {share: text.partition(" deg, ")[2].partition("current")[0] for share, (text, _) in texts.items()}
+    assert said == {
+        -0.01: "below its lower limit, ",
+        0.01: "near its lower limit, ",
+        0.5: "",
+        0.99: "near its upper limit, ",
+        1.01: "above its upper limit, ",
+    }
+    assert [red for _, red in texts.values()] == [True, True, False, True, True]
+
+
+def test_a_simulated_cell_shows_the_rate_of_its_own_time(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+    with rig(tmp_path, checkout, browser, duration_s=LONG_S) as made:
+        made.record()
+        until(made.page, "window.drivegain.points.length > 20 && window.drivegain.status.rate_hz > 0")
+        figures = made.page.inner_text("#figures")
+        assert "1000 Hz, simulated" in figures
+        assert "none: simulated" in figures
+        made.page.click("#stop")
+        made.shown()
+
+
 def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
     """Screenshots for people, in out/, and that nothing is wider than a phone."""
     out = checkout / "out" / "console"
@@ -265,4 +322,20 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
     until(phone, "window.drivegain.points.length > 100")
     phone.wait_for_timeout(500)
     phone.screenshot(path=out / "phone.png", full_page=True)
-    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    for width in (390, 320):
+        phone.set_viewport_size({"width": width, "height": 844})
+        assert phone.evaluate("document.documentElement.scrollWidth") <= width
+        # No column is behind the edge of its table.
+        until(phone, "document.querySelector('.table')")
+        assert phone.evaluate(
+            "[...document.querySelectorAll('.table')].every((one) => one.scrollWidth <= one.clientWidth)"
+        )
+        # A number is on one line with its per cent sign.
+        lines = phone.evaluate(
+            """[...document.querySelectorAll('.table td')].filter((one) => one.textContent.endsWith('%')).map((one) => {
+                const range = document.createRange();
+                range.selectNodeContents(one);
+                return range.getClientRects().length;
+            })"""
+        )
+        assert lines and set(lines) == {1}

@@ -179,3 +179,24 @@ def test_a_simulated_cell_in_lockstep_has_no_load_of_a_bus(cell: Cell, cell_file
         live = Live(cell_file, replace(cell, sync=replace(cell.sync, pacing=pacing)))
         live.take(_text(_run(cell)))
         assert live.status()["bus_load"].keys() == buses
+        assert live.status()["simulated"] is (pacing is PacingMode.LOCKSTEP)
+
+
+@pytest.mark.parametrize("pacing", PacingMode)
+def test_the_sample_rate_is_that_of_the_cells_own_time(cell: Cell, cell_file: Path, pacing: PacingMode) -> None:
+    """A simulated cell answers half as fast again as a real one: its rate is that of its SYNC all the same."""
+    assert cell.sync is not None
+    now_s = [0.0]
+    declared = replace(cell, sync=replace(cell.sync, pacing=pacing))
+    live = Live(cell_file, declared, clock=lambda: now_s[0])
+    live.take(_text(_run(cell)))
+    live.take(_samples(len(cell.axes), 1, so_far=0))
+    live.take(_samples(len(cell.axes), 1, so_far=1))
+    assert live.status()["rate_hz"] == 0.0  # two packets at once are no rate
+    for number in range(40):
+        now_s[0] += 0.02
+        live.take(_samples(len(cell.axes), 1, so_far=15 * number))
+    assert live.run is not None
+    measured = live.rate_hz
+    assert measured > 1.2 * live.run.rate_hz
+    assert live.status()["rate_hz"] == (live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1))

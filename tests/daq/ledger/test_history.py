@@ -731,7 +731,7 @@ def test_a_lost_history_is_not_called_empty(
     # The next entry does not hide that there were others.
     entered = append(_place(cell).audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={})
     reported = _verified(cell, capsys)
-    assert "entries that were noted elsewhere are missing" in reported
+    assert "noted elsewhere and missing here" in reported
     assert entered.sha256[:12] not in reported
     _place(cell).audit.write_bytes(kept)
     caplog.clear()

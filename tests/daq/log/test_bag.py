@@ -130,7 +130,7 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
     assert table.remarks == ()
     cut = read(write_bag(tmp_path / "cut.mcap", parts[1:-1]))
     np.testing.assert_array_equal(cut.values, np.hstack((POSITION, EFFORT))[1:-1])
-    assert cut.remarks == ("2 stamps at the ends of the bag lack joints and are left out",)
+    assert cut.remarks == ("left out, as joints are missing at the ends of the bag: 2 stamps",)
     with pytest.raises(TableUnfit, match=r"found no position.J4, .* at 1700000000.163456.*; expected all joints in"):
         read(write_bag(tmp_path / "gap.mcap", [*parts[:32], *parts[33:]]))
 
@@ -152,7 +152,7 @@ def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
     table = read(write_bag(tmp_path / "run.mcap", [(topic, {**one, "header": header}) for topic, one in whole()]))
     assert table.stamps is not None
     np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 5e-4, atol=1e-12)
-    assert table.remarks == ("200 messages have no stamp; the time of their recording is used",)
+    assert table.remarks == ("200 messages without a stamp: the time of the recording is used",)
 
 
 def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recordin
     (topic, first), *others = whole()
     table = read(write_bag(tmp_path / "run.mcap", [(topic, {**first, "header": header}), *others]))
     assert_whole(table)
-    assert table.remarks == ("1 messages have no stamp; the time of their recording is used",)
+    assert table.remarks == ("1 message without a stamp: the time of the recording is used",)
 
 
 def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
@@ -300,6 +300,19 @@ def _of_text(path: Path) -> Path:
         schema = writer.register_msgdef("std_msgs/msg/String", "string data")
         writer.write_message("/chatter", schema, {"data": "hello"})
     return path
+
+
+@pytest.mark.parametrize("size", [100, 300, 1000])
+def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], size: int
+) -> None:
+    bag = write_bag(tmp_path / "run.mcap", whole())
+    bag.write_bytes(bag.read_bytes()[:size])
+    for words in (["info", bag], ["fit", bag], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
+        assert main([str(word) for word in words]) == 4
+        failure = capfd.readouterr().err
+        assert "the begin of a bag of" in failure
+        assert "`drivegain salvage`" not in failure
 
 
 def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ from daq.errors import (
     LogCorrupt,
     LogIncomplete,
     LogMissing,
-    LogTruncated,
     LogUnreadable,
     OutputFailed,
     UsageError,
@@ -204,8 +203,9 @@ def test_the_name_of_the_whole_recording_is_not_taken(part: Path, tmp_path: Path
 def test_nothing_can_be_saved_of_nothing(tmp_path: Path, checkout: Path) -> None:
     empty = tmp_path / "empty.mcap.part"
     empty.touch()
-    with pytest.raises(LogTruncated):
+    with pytest.raises(LogIncomplete, match="no samples") as refused:
         salvage(empty, tmp_path / "saved.mcap")
+    assert "salvage" not in refused.value.remedy  # it is what has just been tried
     write(tmp_path / "none.mcap", demo_content(checkout), []).rename(tmp_path / "none.mcap.part")
     with pytest.raises(LogIncomplete, match="no samples"):
         salvage(tmp_path / "none.mcap.part", tmp_path / "saved.mcap")

@@ -190,6 +190,8 @@ def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
     vague = replace(calibration, gains=tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains))
     texts = Reader(_page(vague)).texts
     (entry,) = (text for text in texts if text.startswith("J1, J2, J3, J4, J5, J6: found σ 20.00 %"))
+    assert calibration.effects
+    assert "residual" not in entry
     assert entry.endswith("record longer or more exciting moves, or a heavier payload.")
 
 

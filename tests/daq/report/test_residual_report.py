@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console, RenderableType
 from rich.table import Table
@@ -26,13 +28,15 @@ from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import as_document, load_calibration, save_calibration
 from daq.environment import shipped_configurations
-from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError
+from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError, counted
 from daq.report import residual_page as residual_page_module
 from daq.report.document import json_text
 from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
 from daq.report.html import html_page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import (
+    Headline,
+    SentenceScreen,
     _gear_sentence,
     candidate_rows,
     error_change_text,
@@ -44,7 +48,7 @@ from daq.report.residual import (
 )
 from daq.report.residual_document import ResidualReport, residual_report
 from daq.report.residual_page import DOCUMENT, PAGE, residual_page, save_report
-from daq.report.text import Sentence
+from daq.report.text import Sentence, break_lines
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
@@ -891,3 +895,42 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     listed = closed.document()["gear_loss"]
     assert [gear["axis"] for gear in listed] == list(closed.fitted.cell.axis_names)
     assert all(0.0 < gear["motoring_torque"] < 1.0 for gear in listed)
+
+
+def sentences_of(subject: str) -> st.SearchStrategy[tuple[str, ...]]:
+    """Sentences of any length, each another."""
+    lengths = st.lists(st.integers(0, 60), max_size=8)
+    return lengths.map(lambda found: tuple(f"{subject} {n}{' word' * length}." for n, length in enumerate(found)))
+
+
+@given(
+    checks=sentences_of("check"),
+    effects=sentences_of("effect"),
+    judged=sentences_of("judged"),
+    refused=sentences_of("refused"),
+    ending=sentences_of("ending"),
+    room=st.integers(10, 30),
+)
+@pytest.mark.parametrize("width", [80, 120, None])
+def test_whatever_was_found_a_search_prints_one_screen(
+    checks: tuple[str, ...],
+    effects: tuple[str, ...],
+    judged: tuple[str, ...],
+    refused: tuple[str, ...],
+    ending: tuple[str, ...],
+    room: int,
+    width: int | None,
+) -> None:
+    together = "All axes together: the error falls."
+    found = Headline(checks, effects, together, judged, refused, ("The gains are the same.",), ending)
+    shown = [part.text for part in SentenceScreen(found, room).chosen(width)]
+    assert together in shown
+    lines = sum(1 if width is None else len(break_lines(text, width).split("\n")) for text in shown)
+    assert lines <= room + 1  # the last one counts the others
+    everything = list(found.sentences())
+    kept = [text for text in shown if text in everything]
+    assert kept == [text for text in everything if text in kept]  # in their order
+    if len(kept) < len(everything):
+        assert shown[-1].startswith(counted(len(everything) - len(kept), "sentence"))
+    else:
+        assert shown == everything

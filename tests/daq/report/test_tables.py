@@ -320,6 +320,21 @@ def test_a_row_keeps_its_style_in_every_form() -> None:
         assert out.getvalue().count("\x1b[1;31m") >= 2
 
 
+def test_an_error_of_a_fleet_is_below_its_table() -> None:
+    text = "run-17.mcap: " + "found words of a long error; " * 10
+    rows = [FleetRow("press-4", "c" * 64, (), (), Failure("DataUnfit", text, 4), 1.0)]
+    table, *below = fleet_view(rows)
+    assert isinstance(table, WholeTable)
+    assert max(len(str(value)) for column in table.columns for value in column.cells) < 40
+    assert any(str(line) == f"press-4: DataUnfit: {text}" for line in below)
+
+
+def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for() -> None:
+    described = {"stamped_duration_s": 1234567.8, "rate_hz": 1000.0, "wall_minus_monotonic_s": 1.79565e9, "left": 1e-7}
+    lines = [str(line) for line in log_lines(described, 80)]
+    assert lines == ["stamped duration s  1234568", "rate hz             1000", "left                1e-07"]
+
+
 def test_a_log_is_described_in_whole_words() -> None:
     digest = "0123456789abcdef" * 4
     described = {"sha256": digest, "stamped_duration_s": 12345.678, "missing": {f"J{n}": 100 + n for n in range(40)}}

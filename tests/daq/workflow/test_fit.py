@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,10 +18,10 @@ from daq.environment import shipped_configurations
 from daq.errors import LogRepeated, LogsDiffer
 from daq.log.reader import LossyLogs
 from daq.report.document import json_tree
-from daq.report.fit import fit_report, fit_view
+from daq.report.fit import fit_report, fit_view, sigma_notes
 from daq.workflow import fit as fit_module
 from daq.workflow.cases import CaseFit
-from daq.workflow.fit import calibration_of, fit
+from daq.workflow.fit import Fit, calibration_of, fit
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel
@@ -113,6 +114,29 @@ def test_every_method_hears_of_a_payload_that_was_not_there(
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     with pytest.raises(PayloadUnseen):
         fit(_paths("undeclared", "run1", "run2", "run3"), method=method)
+
+
+def moves_in(found: Fit) -> int:
+    """Moves whose scatter is σ."""
+    return len(found.identification.system.clusters)
+
+
+def test_a_sigma_of_few_moves_is_said_to_be_rough(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    found = fit(_paths("run0", "run1"))
+    moves = moves_in(found)
+    (note,) = sigma_notes(found)
+    (percent,) = re.findall(r"known to (\d+) % only", note)
+    assert f"σ rests on {moves} moves" in note
+    # The scatter of a σ that is estimated from so many normal numbers.
+    numbers = np.random.default_rng(1).standard_normal((20_000, moves))
+    assert float(percent) == pytest.approx(100.0 * np.std(numbers.std(axis=1, ddof=1)), abs=1.0)
+    (ratio,) = re.findall(r"a factor of ([\d.]+)\.", note)
+    assert float(ratio) > 1.0 + 0.04 * float(percent)
+    assert [*sigma_notes(fit(_paths("run0", "run1"), method=Method.TLS))] == []  # by a formula
+    assert [*sigma_notes(fit(_paths("run0", "run1"), gains_fixed=True))] == []
+    monkeypatch.setattr("daq.report.fit.ROUGH_SIGMA", 1.0 / np.sqrt(2.0 * (moves - 1)))
+    assert [*sigma_notes(found)] == []
 
 
 def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:

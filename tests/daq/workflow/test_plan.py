@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.workflow.experiment import Experiment, experiment_of, paths_of
-from daq.workflow.plan import Plan, plan, slowed
+from daq.workflow.plan import LONGEST_S, Plan, longer_run_s, nearly_right_joints, plan, slowed
 from drivers.move import Trapezoid
-from ident.planning.clearance import Box
+from ident.planning.clearance import BASE, Box, Capsule
 from ident.planning.excitation import Design
 
 FloatArray = NDArray[np.float64]
@@ -129,8 +130,9 @@ def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment:
     with pytest.raises(UsageError, match="room for"):
         plan(demo, seed=1, duration_s=1.0, experiment=experiment)
     walled = replace(demo, clearance=replace(TIGHT, workspace=Box("workspace", (5.0, 5.0, 5.0), (6.0, 6.0, 6.0))))
-    with pytest.raises(UsageError, match="no clear posture"):
+    with pytest.raises(UsageError, match=r"no clear posture.*payload and the end of the workspace") as shut_in:
         plan(walled, seed=1)
+    assert shut_in.value.remedy == "correct `workspace` in the cell file, or the joint limits"
     with pytest.raises(ConfigurationInconsistent, match="weigh a body"):
         plan(replace(demo, payloads=()), seed=1)
     with pytest.raises(ConfigurationInconsistent, match="plate"):
@@ -155,3 +157,87 @@ def test_a_prediction_that_is_no_number_is_no_plan(
     monkeypatch.setattr(Design, "std_percent", lambda _self, _information: np.full(6, np.nan))
     with pytest.raises(UsageError, match="nan % predicted"):
         plan(demo, seed=1, exchanges=0, experiment=experiment)
+
+
+def advised_s(remedy: str) -> float:
+    """Duration that a remedy advises [s]."""
+    return float(remedy.partition("--duration ")[2].partition(")")[0])
+
+
+@pytest.mark.parametrize("duration_s", [6.0, 10.0, 11.0])
+def test_a_longer_run_that_is_advised_is_longer_and_long_enough(
+    demo: Cell, experiment: Experiment, duration_s: float
+) -> None:
+    with pytest.raises(UsageError, match="condition") as refused:
+        plan(demo, seed=1, duration_s=duration_s, exchanges=0, experiment=experiment, largest_condition=500.0)
+    assert advised_s(refused.value.remedy) > duration_s
+    with pytest.raises(UsageError, match="predicted") as refused:
+        plan(demo, seed=1, duration_s=duration_s, exchanges=0, experiment=experiment, largest_std_percent=0.7)
+    longer_s = advised_s(refused.value.remedy)
+    assert longer_s > duration_s
+    # σ falls with the square root of the time, and random moves scatter.
+    assert _worst(plan(demo, seed=1, duration_s=longer_s, exchanges=0, experiment=experiment)) < 2.0 * 0.7
+
+
+@given(used_s=st.floats(1.0, 3000.0), spare_s=st.floats(0.0, 5.0), ratio=st.floats(1.001, 20.0))
+def test_the_longer_run_exceeds_the_requested_one(used_s: float, spare_s: float, ratio: float) -> None:
+    longer_s = longer_run_s(used_s, used_s + spare_s, ratio)
+    if longer_s is None:
+        assert used_s * ratio**2 > LONGEST_S - 20.0
+        return
+    assert longer_s > used_s + spare_s
+    assert longer_s >= used_s * ratio**2
+    assert longer_s <= LONGEST_S
+
+
+@pytest.mark.parametrize("rounded", ["1.570796", "1.5708", "1.57"])
+def test_a_rounded_angle_of_the_urdf_is_named_and_no_longer_run_is_advised(
+    demo: Cell, experiment: Experiment, rounded: str
+) -> None:
+    assert nearly_right_joints(experiment.design.expectation.model.robot) == ()
+    changed = replace(demo, urdf=demo.urdf.replace("1.57079632679", rounded))
+    turned = [name for name, text in _joints_of(changed.urdf) if rounded in text]
+    assert turned
+    with pytest.raises(UsageError, match="condition") as refused:
+        plan(changed, seed=1, duration_s=30.0, exchanges=0)
+    remedy = refused.value.remedy
+    assert f"the URDF turns {', '.join(turned)} by nearly a right angle" in remedy
+    assert "longer run" not in remedy
+    plan(demo, seed=1, duration_s=30.0, exchanges=0, experiment=experiment)
+
+
+def _joints_of(urdf: str) -> list[tuple[str, str]]:
+    """Name and text of each joint of a URDF."""
+    found: list[tuple[str, str]] = re.findall(r'<joint name="([^"]+)"(.*?)</joint>', urdf, re.DOTALL)
+    return found
+
+
+def test_a_joint_that_is_turned_on_purpose_is_not_called_rounded(demo: Cell) -> None:
+    leaning = replace(demo, urdf=demo.urdf.replace("1.57079632679", "1.5"))
+    assert nearly_right_joints(experiment_of(leaning).design.expectation.model.robot) == ()
+
+
+def test_two_declared_bodies_that_are_always_too_close_are_named(demo: Cell) -> None:
+    column = Capsule("column", BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.4), 0.1)
+    disc = Capsule("disc", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.05)
+    crowded = replace(demo, clearance=Clearance(None, 1.0, (column, disc), ()))
+    with pytest.raises(UsageError, match=r"in \d+ of 100 column and disc are at most") as refused:
+        plan(crowded, seed=1)
+    assert "`clearance.capsules` or `clearance.minimum_m`" in refused.value.remedy
+    assert "workspace" not in refused.value.remedy
+
+
+def test_an_obstacle_around_the_arm_is_named(demo: Cell) -> None:
+    press = Box("press", (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+    with pytest.raises(UsageError, match="and press are at most") as refused:
+        plan(replace(demo, clearance=Clearance(None, 0.01, (), (press,))), seed=1)
+    assert "`press` of `clearance.obstacles`" in refused.value.remedy
+
+
+def test_guessed_bodies_that_never_keep_the_distance_belong_together(demo: Cell) -> None:
+    """As on a short arm, of which two guessed links are some millimetres apart in every posture."""
+    scene = experiment_of(demo).scene
+    near = replace(demo, clearance=Clearance(None, 0.25, (), ()))
+    closer = experiment_of(near).scene
+    assert set(scene.together) < set(closer.together)
+    assert len(plan(near, seed=1, duration_s=30.0, exchanges=0).moves) >= 5

@@ -73,7 +73,7 @@ def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experime
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
     targets = np.array([move.target_rad for move in made.moves])
     assert ((targets >= lower) & (targets <= upper)).all()
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged)
+    text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
     assert "Internal preload obscures no gain: these moves determine 4 of 4 independent directions" in text
     assert "\nAssumed:\n  payload: disc, 8.2 kg\n" in text
     assert max(len(line) for line in text.partition("Assumed:")[2].splitlines()[:7]) < 110
@@ -89,7 +89,7 @@ def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experime
     assert worst > 1.0
     (line,) = (
         line
-        for line in plan_text(Path("plan.yaml"), None, cell, experiment, made, judged).splitlines()
+        for line in plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS).splitlines()
         if line.startswith("For good gains (1 %)")
     )
     seconds = float(line.partition("--duration ")[2].partition(")")[0])
@@ -97,7 +97,7 @@ def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experime
     repeated = verdicts(experiment.design, [(excitation, RUNS)] * int(np.ceil(seconds / made.duration_s)))
     assert max(gain.std_percent for gain in repeated.gains) <= 1.0
     good = replace(judged, gains=repeated.gains)
-    assert "For good gains" not in plan_text(Path("plan.yaml"), None, cell, experiment, made, good)
+    assert "For good gains" not in plan_text(Path("plan.yaml"), None, cell, experiment, made, good, SECONDS)
 
 
 def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
     experiment = experiment_of(five_bar)
     made = plan(five_bar, seed=1, duration_s=SECONDS, exchanges=0, experiment=experiment)
     judged = verdicts(experiment.design, [(experiment.excitation(paths_of(five_bar, made.moves))[0], RUNS)])
-    text = plan_text(Path("plan.yaml"), None, five_bar, experiment, made, judged)
+    text = plan_text(Path("plan.yaml"), None, five_bar, experiment, made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Assembly pose"))
     assert line == (
         "Assembly pose, to compare with the robot: elbow-1 0 deg, elbow-2 0 deg while the motors' joints are at "
@@ -137,7 +137,7 @@ def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Exper
     assert judged.known_preload_rank is not None
     assert judged.rank < judged.known_preload_rank
     named = [cell.axis_names[axis] for axis in hidden]
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged)
+    text = plan_text(Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Internal preload obscures"))
     assert [name for name in cell.axis_names if name in line] == named
     gains = plan_report(Path("plan.yaml"), cell, experiment, made, judged).gains

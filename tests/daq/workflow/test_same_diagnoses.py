@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daq.cli.fit import say_after_fit
+from daq.cli.next_step import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
@@ -34,6 +34,7 @@ from ident.discovery.loop import Step, find_effects
 from ident.effects.dictionary import EFFECTS
 from ident.errors import Diagnosis, IdentificationError
 from ident.estimators.turned_geometry import with_gravity
+from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
 from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import three_axes_truth
@@ -258,3 +259,20 @@ def test_a_zero_is_named_beside_declared_effects_and_not_after_a_search_without_
     assert said(beside_declared) == {"zero-off J2"}
     after_search = description_diagnoses(replace(fitted, steps=(replace(step, declared=False),)))
     assert after_search == ()
+
+
+def test_the_key_that_is_named_reverses_a_position_and_no_current(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in map(reversed_position, recorded)}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    (diagnosis,) = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True).diagnoses
+    assert (diagnosis.name, diagnosis.axes) == ("position-reversed", ("J2",))
+    assert "the row of J2 in `drive_train.ratio`" in diagnosis.remedy
+    declared = cell.ratio
+    corrected = declared * np.array([1.0, -1.0, 1.0])[:, None]
+    # The way from motor to joint turns for J2 alone, and the torque of a motor at its joint stays.
+    counts = np.array([1.0, 2.0, 3.0])
+    turned_rad = np.linalg.inv(corrected) @ counts / (np.linalg.inv(declared) @ counts)
+    np.testing.assert_allclose(turned_rad, [1.0, -1.0, 1.0])
+    np.testing.assert_allclose(DriveTrain(corrected).direction, DriveTrain(declared).direction)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.cli import main
-from daq.cli.validate import cell_of
+from daq.cli.next_step import cell_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import CalibrationUnreadable

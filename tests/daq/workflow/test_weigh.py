@@ -119,6 +119,14 @@ def test_a_log_that_declares_a_payload_is_not_bare(
     assert "found:    payload 'disc'" in capsys.readouterr().err
     assert main(["weigh", log, log, *known]) == 4
     assert "found:    the same log twice" in capsys.readouterr().err
+    bare = str(write(tmp_path / "b.mcap", demo_content(checkout), samples((angle + 1).tolist())))
+    for logs, mixed in (([bare, log], log), ([log, bare], bare)):
+        assert main(["weigh", *logs, *known]) == 4
+        said = capsys.readouterr().err
+        assert f"error:    {mixed}" in said
+        assert "payload 'disc' in mounting 'flange-a'" in said
+        assert "no load" in said
+        assert "--bare" in said
     assert main(["contact", log, *known]) == 4
     assert "nothing is known of mounting 'flange-a'" in capsys.readouterr().err
 
@@ -171,7 +179,7 @@ def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
     text = _text(weighed_view(found))
     assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
     assert re.search(r"centre x in plate +-18\.0 ± 4\.4 +mm", text)
-    assert "no beside a σ: it is more than 10 % of the value" in text
+    assert "Not identifiable with a σ: it is more than 10 % of the value" in text
     in_platform = weigh_report(found).centre_in_platform_m
     assert in_platform is not None
     assert in_platform.value == [pytest.approx(-0.018), pytest.approx(0.03), None]

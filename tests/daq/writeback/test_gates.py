@@ -507,6 +507,20 @@ def test_just_inside_its_bound_a_gate_is_open(scene: Scene, kept: Callable[[Scen
     assert kept(scene).propose().refusals == ()
 
 
+@pytest.mark.parametrize("effects", [True, False])
+def test_a_number_just_beyond_its_bound_is_not_written_as_the_bound(scene: Scene, effects: bool) -> None:
+    """And a large σ is looked for in what the model lacks first, where that was not done."""
+    bound = scene.policy.max_std_percent
+    std = 1.0001e-2 * bound * abs(scene.calibration.gains[0].value)
+    doubtful = _gain("J1", std=std)(scene)
+    if not effects:
+        doubtful = _calibration(effects=())(doubtful)
+    (refusal,) = doubtful.propose().refusals
+    assert refusal.gate is Gate.UNCERTAINTY
+    assert float(refusal.found.removeprefix("σ ").removesuffix(" %")) > bound
+    assert ("`drivegain residual`" in refusal.remedy) is not effects
+
+
 def test_a_reviewed_change_of_a_changed_file_may_go_on(scene: Scene) -> None:
     scene = _edited(scene)
     (refusal,) = scene.propose().refusals

@@ -56,6 +56,17 @@ def test_a_node_without_name_and_serial_is_described_as_far_as_it_reports() -> N
     assert (found.device_name, found.state) == (None, None)
 
 
+def test_a_node_with_a_vendor_alone_has_an_identity() -> None:
+    network, bus = cell(1)
+    for subindex in (2, 3, 4):
+        del bus.nodes[0].objects[0x1018, subindex]
+    network.axes = (replace(network.axes[0], identity=Identity(0x29A)),)
+    with network:
+        (found,) = network.scan(wait_s=0.05)
+        assert network.check_identities() == (Identity(0x29A),)
+    assert (found.identity, found.problems) == (Identity(0x29A), ())
+
+
 def test_prepare_sets_up_and_leaving_restores_everything() -> None:
     network, bus = cell(2)
     before = [copy.deepcopy(node.objects) for node in bus.nodes]
@@ -123,12 +134,14 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sub", "field"), [(1, "vendor id"), (2, "product code"), (4, "serial number")], ids=["vendor", "product", "serial"]
+    ("sub", "field", "number"),
+    [(1, "vendor id", "0x1234"), (2, "product code", "0x1234"), (4, "serial number", "4660")],
+    ids=["vendor", "product", "serial"],
 )
-def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field: str) -> None:
+def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field: str, number: str) -> None:
     network, bus = cell(2)
     bus.nodes[1].store(0x1018, sub, 0x1234)
-    with network, pytest.raises(SetupRefused, match=rf"J2 \(node 2\): {field} .*0x1234"):
+    with network, pytest.raises(SetupRefused, match=rf"J2 \(node 2\): {field} .*is {number},"):
         network.prepare()
     writes = [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1]
     assert writes == []
