@@ -48,13 +48,13 @@ class FolderRuns:
     loaded: tuple[Path, ...] = ()  #: with a payload
 
 
-def runs_in(folder: Path, cell: str) -> FolderRuns:
-    """Find the valid runs of a cell in a folder; none where its logs are too large to be read for a hint."""
+def runs_in(folder: Path, cell: str) -> FolderRuns | None:
+    """Find the valid runs of a cell in a folder; None where its logs are too large to be read for a hint."""
     from daq.report.log import info_report
 
     logs = sorted(folder.glob("*.mcap"), key=lambda log: log.stat().st_mtime)
     if sum(log.stat().st_size for log in logs) > LARGEST_FOLDER_BYTES:
-        return FolderRuns()
+        return None
     unloaded = []
     loaded = []
     for log in logs:
@@ -82,7 +82,7 @@ def say_after_plan(cell: Path, declared: Cell, plan: Path, made: Plan) -> None:
 
     A plan for the fit comes first. A second one, of another seed, is for the held-out run.
     """
-    runs = runs_in(Path(), declared.name)
+    runs = runs_in(Path(), declared.name) or FolderRuns()
     if runs.unloaded and runs.loaded:
         _say_record(cell, declared, plan, Path("held-out.mcap"), loaded=True)
         return
@@ -116,11 +116,22 @@ def _say_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loaded: bo
     say_next("drivegain", "record", cell, plan, "--out", free_name(log), *mounted, "--enable-motion")
 
 
-def say_after_record(cell: Path, declared: Cell, plan: Path, log: Path) -> None:
-    """Name the run that is still missing, else the fit of one run without load, one with, and a held-out one."""
+def say_after_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loaded: bool) -> None:
+    """Name the run that is still missing, else the fit of one run without load, one with, and a held-out one.
+
+    Args:
+        cell: file of the cell.
+        declared: its content.
+        plan: file of the moves that were made.
+        log: that was recorded.
+        loaded: with a payload.
+    """
     if not declared.payloads:
         return
     runs = runs_in(log.parent, declared.name)
+    if runs is None and loaded:
+        return
+    runs = runs or FolderRuns(unloaded=(log,))
     if not runs.loaded:
         _say_record(cell, declared, plan, Path("loaded.mcap"), loaded=True)
         return

@@ -120,7 +120,7 @@ def record_verb(options: RecordOptions) -> None:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
     if not options.json:
-        say_after_record(options.cell, declared, options.plan, out)
+        say_after_record(options.cell, declared, options.plan, out, loaded=carried is not None)
 
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:

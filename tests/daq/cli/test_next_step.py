@@ -92,11 +92,16 @@ def test_runs_of_a_folder_are_the_valid_ones_of_this_cell(cell: Cell, make_log: 
 
 
 def test_logs_that_take_long_to_read_are_not_read_for_a_hint(
-    cell: Cell, make_log: LogMaker, monkeypatch: pytest.MonkeyPatch
+    cell: Cell, made: Plan, make_log: LogMaker, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make_log("bare.mcap")
     monkeypatch.setattr("daq.cli.next_step.LARGEST_FOLDER_BYTES", 10)
-    assert runs_in(Path(), "demo") == FolderRuns()
+    written("plan.yaml", made, 0.6, seed=1)
+    bare = make_log("bare.mcap")
+    assert runs_in(Path(), "demo") is None
+    say_after_record(CELL, cell, Path("plan.yaml"), bare, loaded=False)
+    assert "--payload" in words(capsys.readouterr().err)  # the run with the payload is never wrong
+    say_after_record(CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True)
+    assert capsys.readouterr().err == ""  # of the others nothing is known
 
 
 def test_a_free_name_is_counted_on(tmp_path: Path) -> None:
@@ -117,25 +122,25 @@ def test_each_plan_is_followed_by_the_run_that_is_missing(
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     assert words(capsys.readouterr().err)[1:] == bare
 
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("bare.mcap"))
+    say_after_record(CELL, cell, Path("plan.yaml"), make_log("bare.mcap"), loaded=False)
     weighed = ["--payload", "disc", "--mass", "KG", "--enable-motion"]
     loaded = ["record", str(CELL), "plan.yaml", "--out", "loaded.mcap", *weighed]
     assert words(capsys.readouterr().err)[1:] == loaded
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     assert words(capsys.readouterr().err)[1:] == loaded
 
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True))
+    say_after_record(CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True)
     assert words(capsys.readouterr().err)[1:] == ["fit", "bare.mcap", "loaded.mcap", "--out", "calibration.yaml"]
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     held_out = ["record", str(CELL), "plan-2.yaml", "--out", "held-out.mcap", *weighed]
     assert words(capsys.readouterr().err)[1:] == held_out
 
     Path("calibration.yaml").touch()
-    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("held-out.mcap", loaded=True))
+    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("held-out.mcap", loaded=True), loaded=True)
     search = words(capsys.readouterr().err)
     assert search[1:5] == ["residual", "bare.mcap", "loaded.mcap", "--holdout"]
     assert search[5:] == ["held-out.mcap", "--out", "calibration-2.yaml", "--report", "report"]
-    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("more.mcap", loaded=True))
+    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("more.mcap", loaded=True), loaded=True)
     assert capsys.readouterr().err == ""  # it is not plain which of them is held out
 
 
@@ -156,7 +161,7 @@ def test_a_run_with_load_that_was_first_is_followed_by_one_without(
     cell: Cell, made: Plan, make_log: LogMaker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written("plan.yaml", made, 0.6, seed=1)
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("first.mcap", loaded=True))
+    say_after_record(CELL, cell, Path("plan.yaml"), make_log("first.mcap", loaded=True), loaded=True)
     assert "--payload" not in words(capsys.readouterr().err)
 
 

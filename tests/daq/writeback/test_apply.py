@@ -50,8 +50,8 @@ def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
     proposal = _propose(demo_calibration(), controller)
     assert proposal.refusals == ()
     assert [change.axis for change in proposal.edit.changes] == list(AXES)
-    assert "-    gain: -11.52       # Nm at the joint per A, from the data sheet\n" in proposal.edit.diff
-    assert "+    gain: -9.2100       # Nm at the joint per A, from the data sheet\n" in proposal.edit.diff
+    assert "-    gain: -11.52       # Nm at the joint per A\n" in proposal.edit.diff
+    assert "+    gain: -9.2100       # Nm at the joint per A\n" in proposal.edit.diff
     assert proposal.edit.diff.count("\n+ ") == proposal.edit.diff.count("\n- ") == 6
     assert controller.read_bytes() == before
     assert list(controller.parent.iterdir()) == [controller]
