@@ -16,7 +16,7 @@ from daq.documents.session_state import Outcome, SessionState
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
-from daq.jobs.context import JobContext
+from daq.jobs.context import SessionContext
 from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
@@ -41,7 +41,7 @@ class Conclusion:
     remark: str  #: reason, in one sentence
 
 
-def report_success(context: JobContext, session: Session) -> Conclusion:
+def report_success(context: SessionContext, session: Session) -> Conclusion:
     """Report a session whose state has its outcome.
 
     Raises:
@@ -53,7 +53,7 @@ def report_success(context: JobContext, session: Session) -> Conclusion:
     return _report(context, session, outcome, code, remark, "")
 
 
-def report_failure(context: JobContext, folder: Path, error: BaseException) -> None:
+def report_failure(context: SessionContext, folder: Path, error: BaseException) -> None:
     """Report the error that ended a job; failures of the report itself are attached to the error as notes."""
     try:
         session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
@@ -66,7 +66,9 @@ def report_failure(context: JobContext, folder: Path, error: BaseException) -> N
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
 
-def audit_entry(context: JobContext, action: AuditAction, session: Session, details: dict[str, object]) -> AuditEntry:
+def audit_entry(
+    context: SessionContext, action: AuditAction, session: Session, details: dict[str, object]
+) -> AuditEntry:
     """Append an entry about the session to the audit.
 
     Raises:
@@ -83,7 +85,7 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
 
 
 def _report(
-    context: JobContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
+    context: SessionContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
 ) -> Conclusion:
     now = context.tools.now()
     state = session.state.with_(
@@ -111,12 +113,12 @@ def _report(
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
         replace_file(session.folder / SUMMARY_JSON, json_text(conclusion_report(conclusion, context.file)).encode())
-    found = sessions.sessions(context.section.folder, context.cell.name)
-    if context.section.metrics is not None:
+    found = sessions.sessions(context.settings.folder, context.cell.name)
+    if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
         try:
             write_metrics(
-                context.section.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
+                context.settings.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
             )
         except OutputFailed as error:
             # A monitor reports missing metrics itself; the calibration is done.
@@ -127,7 +129,7 @@ def _report(
     return conclusion
 
 
-def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
+def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
     # Where the calibrations in force are unknown, all sessions stay.
     try:
         history = read_history(context.ledger)
@@ -139,7 +141,7 @@ def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
         return
     newest = {event.target: event.digest for event in history.events}
     in_force = frozenset(digest for digest in newest.values() if digest is not None)
-    for folder in sessions.remove_old(found, context.section.keep_sessions, in_force):
+    for folder in sessions.remove_old(found, context.settings.keep_sessions, in_force):
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
 
