@@ -33,6 +33,7 @@ BY_JOB = {
     Job.COMMISSION: (
         Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
         Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
+        Listed("calibrate", "daq.cli.calibrate:CALIBRATE", "One session: check, record, identify, write, accept."),
         Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
         Listed("plan", "daq.cli.plan:PLAN", "Choose moves that show the worst gain best."),
         Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),

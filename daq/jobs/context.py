@@ -47,8 +47,8 @@ CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
 
 # A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop when it stays away,
 # so a session waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE
-# (605Ah = 5 to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed recorder
-# belongs to another controller: it is left alone.
+# (605Ah = 5 to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed
+# recorder belongs to another controller: it is left alone.
 
 FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 LEFT = (State.QUICK_STOP_ACTIVE, State.SWITCHED_ON)  #: States of power without a motion that a killed recorder leaves
@@ -262,13 +262,16 @@ class Schedule(Protocol):
     def is_complete(self, session: Session) -> bool:
         """Whether nothing is left to record; the recorded runs of the session are verified."""
 
-    def next_run(self, context: SessionContext, session: Session) -> NextRun | None:
-        """Return the next run to record; None where the session has what it needs.
+    def next_run(self, context: SessionContext, session: Session) -> tuple[Session, NextRun | None]:
+        """Decide the next run; None where the session has what it needs. The decision is in the session's state.
 
         Args:
             context: of the session.
             session: its recorded runs are verified.
         """
+
+    def after_run(self, context: SessionContext, session: Session) -> Session:
+        """Judge what was recorded so far."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -34,8 +35,12 @@ class Operator(Protocol):
             JobHeld: it is not mounted.
         """
 
-    def weigh(self, run: PlannedRun) -> float | None:
-        """Return the mass of the payload as read from the scale [kg]; None without load, or if it was not weighed."""
+    def weigh(self, payload: str) -> float:
+        """Return the mass of a payload as read from the scale [kg].
+
+        Raises:
+            JobHeld: it was not weighed.
+        """
 
     def permit_motion(self, run: PlannedRun) -> str:
         """Return who permits the motion of a run, in words for its log.
@@ -83,9 +88,17 @@ class CellPolicy:
                 remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {run.name}",
             )
 
-    def weigh(self, run: PlannedRun) -> float | None:
+    def weigh(self, payload: str) -> float:
         """Return the mass that was weighed for this job, from the cell file [kg]."""
-        return run.mass_kg
+        for run in self.section.runs:
+            if run.payload == payload and run.mass_kg is not None:
+                return run.mass_kg
+        raise JobHeld(
+            f"payload {payload}",
+            found="no run of `recalibration` that carries it",
+            expected="its mass_kg, as weighed for the job",
+            remedy="add it to the runs of the cell file",
+        )
 
     def permit_motion(self, run: PlannedRun) -> str:
         """Name policy and interlock; `section_of` has refused a cell without this permission."""
@@ -96,3 +109,31 @@ class CellPolicy:
         is_of_job = self.cell.apply.by is AppliedBy.JOB
         has_drives = self.cell.controller is not None and bool(self.cell.controller.objects)
         return is_of_job and not has_drives and not touched
+
+
+@dataclass(frozen=True, slots=True)
+class GivenAnswers:
+    """Answers that were given beforehand: for a demonstration, and for a simulated cell without a person."""
+
+    who: str
+    masses_kg: Mapping[str, float]  #: of each payload
+    put: Callable[[str | None], None]  #: mounts a payload by its name, None for nothing
+    granted_by: str  #: who permits the motion, in words for the logs
+    writes: bool = True  #: whether a change that passed all gates is written
+    unguarded: bool = False
+
+    def mount(self, run: PlannedRun) -> None:
+        """Mount what the run carries."""
+        self.put(run.payload)
+
+    def weigh(self, payload: str) -> float:
+        """Return the given mass [kg]."""
+        return self.masses_kg[payload]
+
+    def permit_motion(self, run: PlannedRun) -> str:
+        """Return who permitted it beforehand."""
+        return self.granted_by
+
+    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+        """Approve what was approved beforehand, unless the file was changed since."""
+        return self.writes and not touched

@@ -69,7 +69,10 @@ def record_runs(context: SessionContext, session: Session) -> Session:
     """
     session = context.schedule.prepare(context, verified_runs(session))
     is_warm = False
-    while (run := context.schedule.next_run(context, session)) is not None:
+    while True:
+        session, run = context.schedule.next_run(context, session)
+        if run is None:
+            return session
         planned = run.planned
         run_context = context.within(f"record {planned.name}")
         context.operator.mount(planned)
@@ -77,9 +80,9 @@ def record_runs(context: SessionContext, session: Session) -> Session:
         if not is_warm:
             _warm_up(context, session, run)
             is_warm = True
-        recorded = _record_valid(run_context, session, run)
+        recorded = record_valid(run_context, session, run)
         session = session.update(runs=(*session.state.runs, recorded))
-    return session
+        session = context.schedule.after_run(context, session)
 
 
 def _warm_up(context: SessionContext, session: Session, run: NextRun) -> None:
@@ -116,11 +119,15 @@ class FixedRuns:
         """Whether each of them is recorded."""
         return not self._left(session)
 
-    def next_run(self, context: SessionContext, session: Session) -> NextRun | None:
+    def next_run(self, context: SessionContext, session: Session) -> tuple[Session, NextRun | None]:
         """Return the first one that is not recorded."""
         for planned in self._left(session):
-            return NextRun(planned, self._plan(context.within("plan"), session, planned))
-        return None
+            return session, NextRun(planned, self._plan(context.within("plan"), session, planned))
+        return session, None
+
+    def after_run(self, context: SessionContext, session: Session) -> Session:
+        """Judge nothing: all of them are recorded, whatever they show."""
+        return session
 
     def _left(self, session: Session) -> list[PlannedRun]:
         made = {run.name for run in session.state.runs}
@@ -143,7 +150,7 @@ class FixedRuns:
         return load_plan(path, context.cell)  # as a person can read it
 
 
-def _record_valid(context: SessionContext, session: Session, run: NextRun) -> RecordedRun:
+def record_valid(context: SessionContext, session: Session, run: NextRun) -> RecordedRun:
     """Record a run, again if the recording is invalid."""
     planned = run.planned
     out = log_of(session, planned.name)
@@ -194,7 +201,7 @@ def _record(context: SessionContext, run: NextRun, out: Path) -> Recorded:
         operator=context.who,
         granted_by=context.operator.permit_motion(planned),
         run_id=str(uuid.uuid4()),
-        entered_kg=context.operator.weigh(planned),
+        entered_kg=planned.mass_kg,
         unguarded=context.operator.unguarded,
     )
     return context.tools.record(

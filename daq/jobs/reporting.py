@@ -12,7 +12,7 @@ from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
-from daq.documents.session_state import Outcome, SessionState
+from daq.documents.session_state import GuidedState, Outcome, SessionState
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
@@ -23,7 +23,7 @@ from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.document import json_text
-from daq.report.job_schemas import JobReport, RefusedJob
+from daq.report.job_schemas import JobReport, RefusedJob, SessionReport
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
 
@@ -145,7 +145,7 @@ def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
 
-def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | RefusedJob:
+def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | SessionReport | RefusedJob:
     """Return how a job ended, for `recalibrate --json` and summary.json."""
     refused = RefusedJob(
         outcome=conclusion.outcome,
@@ -158,7 +158,8 @@ def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | Re
         return refused
     # Not strictly: what is a tuple in a state is a list in its mapping.
     values = {**session.state.model_dump(), **dict(refused), "folder": str(session.folder)}
-    return JobReport.model_validate(values, strict=False)
+    kind = SessionReport if isinstance(session.state, GuidedState) else JobReport
+    return kind.model_validate(values, strict=False)
 
 
 def text(conclusion: Conclusion, cell_file: Path) -> str:
@@ -191,6 +192,8 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                     f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} "
                     f"{gain.unit} found{change}{drift}{': differs' if gain.differs else ''}"
                 )
+        if isinstance(state, GuidedState):
+            lines += _guided_lines(state)
         drifts = [gain.alarm for gain in state.watched if gain.alarm]
         if drifts:
             lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
@@ -199,6 +202,17 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
             lines.append(f"Report: {session.folder / REPORT / 'report.html'}")
     lines += ["", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
     return "\n".join(lines) + "\n"
+
+
+def _guided_lines(state: GuidedState) -> list[str]:
+    """What a guided session adds: what was not reached, and whether new moves accept the gains."""
+    lines: list[str] = []
+    if state.missing:
+        lines += ["", f"Not reached: {state.missing}"]
+    if state.acceptance is not None:
+        verdict = "accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        lines += ["", f"New moves: {verdict}: {state.acceptance.remark}"]
+    return lines
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
