@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
+import os
 import sys
+import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,16 +21,20 @@ from daq.report.text import printable
 from drivers.errors import MotionRefused, stop_notes
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell
+    from daq.config.cell import Cell, WeighedPayload
     from daq.config.recalibration import PlannedRun
     from daq.jobs.calibrate import CheckLine
+    from daq.jobs.context import Tools
+    from daq.log.feed import Feed
     from daq.workflow.fit import Fit
+    from daq.workflow.record import Recorded, RecordingRequest
     from daq.writeback.file_target import FileEdit
     from daq.writeback.target import Proposal
     from ident.calibration import Calibration
     from ident.discovery.before_after import Account
 
 YES = "yes"  #: What the operator types to write
+KEEP = "keep"  #: What the operator types where a block shows a mistake and is right all the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +48,17 @@ class CalibrateOptions:
     check: Annotated[bool, typer.Option("--check", help="Only check what a session needs; nothing moves.")] = False
     payload: Annotated[str | None, typer.Option(help="Body for the loaded blocks, if the cell has several.")] = None
     target: Annotated[
-        float | None, typer.Option(help="σ of every gain at which the recording ends [%].", min=0.05, max=10.0)
+        float | None,
+        typer.Option(
+            help="σ of every gain at which the recording ends [%]; target_sigma_percent of the cell file by default.",
+            min=0.05,
+            max=10.0,
+        ),
     ] = None
     block: Annotated[float, typer.Option(help="Duration of a block [s].", min=5.0, max=600.0)] = 20.0
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="First make the moves of three blocks at 25 % of their speed.")
+    ] = False
     time_limit: Annotated[float, typer.Option(help="Motion after which the recording ends [min].", min=1.0)] = 30.0
     sessions: Annotated[
         Path | None, output_option("--sessions", "Folder of the sessions, by default beside the cell file.")
@@ -74,27 +86,27 @@ class Person:
 
     def mount(self, run: PlannedRun) -> None:
         """Ask for what the next block carries."""
-        if run.payload is None:
-            wanted = "NOTHING on the flange"
-        else:
-            wanted = f"{run.payload.upper()} ({run.mass_kg:g} kg) on the flange"
+        from daq.jobs.position import on_flange
+
         say("")
-        say(f"{run.name}: {wanted}")
+        say(f"── {run.name}: {on_flange(run)} ──", bold=True)
         if self.asks_before_motion:
-            ask("Mount it if it is not, leave the cell, then press Enter")
+            todo = "Take off what is there" if run.payload is None else "Mount it if it is not mounted"
+            ask(f"{todo}, leave the cell, then press Enter")
 
     def weigh(self, payload: str) -> float:
-        """Ask for the mass from the scale, twice."""
-        from daq.workflow.safeguards import check_entered_mass
-
+        """Ask for the mass from the scale, twice, until both are the same and that of the cell file."""
         declared = next(one for one in self.cell.payloads if one.name == payload)
         while True:
-            first = _number(ask(f"Mass of {payload} read from the scale [kg]"))
-            second = _number(ask("The same once more"))
-            if first is not None and first == second:
-                check_entered_mass(self.cell, declared.payload, first)
-                return first
-            say("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
+            first_kg = _number(ask(f"Mass of {payload} read from the scale [kg]"))
+            second_kg = _number(ask("The same once more"))
+            if first_kg is None or first_kg != second_kg:
+                say("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
+                continue
+            refusal = _refused_mass(declared, first_kg)
+            if not refusal:
+                return first_kg
+            say(refusal)
 
     def permit_motion(self, run: PlannedRun) -> str:
         """Ask once more before power comes on."""
@@ -104,19 +116,39 @@ class Person:
             ask(f"The robot moves now. Press Enter to start {run.name}, Ctrl-C to stop here")
         return self.who
 
+    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+        """Ask whether a block with a mistake is recorded again; `keep` keeps it."""
+        return ask(f"Press Enter to record it again, or type {KEEP} to keep {run.name} as it is") != KEEP
+
     def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""
         from daq.report.proposal import show_proposal
 
         show_proposal(proposal, output_console())
         if touched:
-            say("The controller's file was written or rolled back since the session began.")
+            say("! The controller's file was written or rolled back since the session began.")
         return ask(f"Type {YES} to write these gains to {proposal.edit.subject}, anything else to leave them") == YES
 
 
-def say(text: str) -> None:
+def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
+    """Return why a mass from the scale is not taken; empty where it is."""
+    from daq.workflow.safeguards import agree
+
+    tolerance_kg = declared.mass_tolerance_kg
+    if agree(mass_kg, declared.mass_kg, tolerance_kg):
+        return ""
+    expected = f"the cell file has {declared.mass_kg:g} kg within {tolerance_kg:g} kg"
+    if agree(mass_kg / 1000.0, declared.mass_kg, tolerance_kg):
+        return f"Found {mass_kg:g}, which is the mass in grams; {expected}. Type it in kg."
+    return (
+        f"Found {mass_kg:g} kg; {expected}. Weigh it again. If the cell file is wrong, press Ctrl-C and correct it: "
+        "all gains are in proportion to this mass."
+    )
+
+
+def say(text: str, *, bold: bool = False) -> None:
     """Print a line for the operator."""
-    typer.echo(printable(text), err=True)
+    typer.secho(printable(text), err=True, bold=bold)
 
 
 def ask(question: str) -> str:
@@ -125,7 +157,7 @@ def ask(question: str) -> str:
     Raises:
         JobHeld: nobody answers.
     """
-    typer.echo(printable(f"{question}: "), err=True, nl=False)
+    typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
     answer = sys.stdin.readline()
     if not answer:
         typer.echo("", err=True)
@@ -136,6 +168,13 @@ def ask(question: str) -> str:
             remedy="start the same command in a terminal; the session goes on where it is",
         )
     return answer.strip()
+
+
+def open_page(page: Path) -> None:
+    """Show a page in the browser, where a person is at a terminal with a display."""
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if has_display and sys.stdin is not None and sys.stdin.isatty():
+        webbrowser.open(page.resolve().as_uri())
 
 
 def _number(text: str) -> float | None:
@@ -168,6 +207,29 @@ def _show_check(lines: Sequence[CheckLine]) -> None:
         raise typer.Exit(ExitCode.CONFIGURATION)
 
 
+def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
+    """Return the tools of a session, which show a person what they do."""
+    from daq.jobs.certificate import save_certificate
+    from daq.jobs.context import Tools
+    from daq.report.residual_page import PAGE
+    from daq.workflow.record import record
+
+    def save_report(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
+        certificate = save_certificate(cell_file, cell, fitted, changed, calibration, folder)
+        say("")
+        say(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
+        open_page(folder / PAGE)
+
+    def record_with_bar(request: RecordingRequest, **further: Any) -> Recorded:
+        # A bar of its own: between two blocks the operator types, and a bar would take the line.
+        with progress_bar(f"recording {request.out.stem}") as report_progress:
+            return record(
+                request, feed=feed, progress=lambda done, total: report_progress(done, total, "moves"), **further
+            )
+
+    return Tools(save_report=save_report, record=record_with_bar)
+
+
 @taking(CalibrateOptions)
 def calibrate_verb(options: CalibrateOptions) -> None:
     """Calibrate a cell in one session: check, record until every gain is precise, identify, write, accept.
@@ -176,47 +238,34 @@ def calibrate_verb(options: CalibrateOptions) -> None:
     command goes on where the session is. Nothing is written to the controller before you have typed `yes`.
     """
     from daq.config.cell_file import load_cell
-    from daq.jobs.calibrate import calibrate, check, context_of, payload_of
-    from daq.jobs.context import Tools
-    from daq.jobs.guided import TARGET_PERCENT, GuidedSettings
-    from daq.jobs.journal import Form, Journal
-    from daq.jobs.reporting import conclusion_report, text
-    from daq.jobs.session import CALIBRATION
+    from daq.jobs.calibrate import calibrate, check_readiness, context_of, payload_for_blocks
+    from daq.jobs.guided import GuidedSettings
+    from daq.jobs.journal import Form
+    from daq.jobs.position import sessions_folder
+    from daq.jobs.reporting import ending, session_report
+    from daq.jobs.story import Story
     from daq.log.feed import Feed
-    from daq.report.certificate import compare
-    from daq.report.residual_page import save_report
-    from daq.workflow.record import record
-    from daq.writeback.request import Request
 
     declared = load_cell(options.cell)
     _check_yes_move(declared, options.yes_move)
-    payload = payload_of(declared, options.payload)
+    payload = payload_for_blocks(declared, options.payload)
     settings = GuidedSettings(
-        options.sessions or options.cell.with_suffix(".sessions"),
+        options.sessions or sessions_folder(options.cell),
         payload.name,
-        target_percent=options.target or TARGET_PERCENT,
+        target_percent=options.target or declared.target_sigma_percent,
         block_s=options.block,
         time_limit_min=options.time_limit,
+        rehearse=options.rehearse,
     )
     person = Person(declared, options.by or login(), options.enable_motion, not options.yes_move)
-    journal = Journal(sys.stderr, Form.TEXT, lambda: datetime.now(UTC))
-
-    def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
-        request = Request(calibration, datetime.now(UTC))
-        command = f"drivegain apply {shlex.quote(str(options.cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-        save_report(fitted, changed, calibration, folder, compare(declared, request, command))
+    journal = Story(sys.stderr, Form.TEXT, lambda: datetime.now(UTC))
 
     try:
-        with (
-            interruptible() as block_signals,
-            Feed(options.cell) as feed,
-            progress_bar("recording") as report_progress,
-        ):
-            recorder = partial(record, feed=feed, progress=lambda done, total: report_progress(done, total, "moves"))
-            tools = Tools(save_report=certify, record=recorder)
+        with interruptible() as block_signals, Feed(options.cell) as feed:
+            tools = _tools(options.cell, declared, feed)
             if options.check:
                 context = context_of(options.cell, declared, settings, person, tools, journal)
-                _show_check(check(context, options.payload, options.block))
+                _show_check(check_readiness(context, options.payload, options.block))
                 return
             if not options.enable_motion:
                 raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
@@ -226,9 +275,9 @@ def calibrate_verb(options: CalibrateOptions) -> None:
         say_last(f"interrupted: {axes}; the same command goes on where the session is")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     if options.json:
-        print_json(conclusion_report(ended, options.cell))
+        print_json(session_report(ended, options.cell))
     else:
-        typer.echo(printable(text(ended, options.cell)), nl=False)
+        typer.echo(printable(ending(ended, options.cell)), nl=False)
     if ended.exit_code:
         raise typer.Exit(ended.exit_code)
 

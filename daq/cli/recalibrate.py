@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
 import sys
 from dataclasses import replace
@@ -26,9 +25,6 @@ from ident.errors import IdentificationError
 
 if TYPE_CHECKING:
     from daq.jobs.journal import Journal
-    from daq.workflow.fit import Fit
-    from ident.calibration import Calibration
-    from ident.discovery.before_after import Account
 
 
 def recalibrate_verb(
@@ -70,29 +66,20 @@ def recalibrate_verb(
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
     from daq.config.cell_file import load_cell
+    from daq.jobs.certificate import save_certificate
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.reporting import conclusion_report, text
-    from daq.jobs.session import CALIBRATION
     from daq.log.feed import Feed
-    from daq.report.certificate import compare
     from daq.report.job_schemas import DryRunReport
-    from daq.report.residual_page import save_report
     from daq.workflow.record import record
-    from daq.writeback.request import Request
 
     declared = load_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
-
-        def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
-            request = Request(calibration, datetime.now(UTC))
-            command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-            save_report(fitted, changed, calibration, folder, compare(declared, request, command))
-
-        tools = Tools(save_report=certify, record=partial(record, feed=feed))
+        tools = Tools(save_report=partial(save_certificate, cell, declared), record=partial(record, feed=feed))
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:

@@ -8,16 +8,14 @@ import numpy as np
 
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis
-from daq.errors import writing
 from daq.files import sha256_of
 from daq.jobs.context import NextRun, SessionContext
-from daq.jobs.guided import guided
+from daq.jobs.guided import guided, plan_moves, require_same_cell
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, record_valid
 from daq.jobs.session import Session
 from daq.jobs.stages import calibration_made
-from daq.workflow.plan import load_plan, save_plan
-from daq.workflow.validate import Validation, validate
+from daq.workflow.validate import Validation
 from ident.calibration import Calibration
 
 RUN = "acceptance"  #: Name of its log
@@ -40,14 +38,14 @@ class Accept:
         if state.outcome is not Outcome.APPLIED or state.acceptance is not None:
             return session
         context = context.within("accept")
+        require_same_cell(context)
         last = state.blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
         seed = context.settings.seed + SEED_STEP
-        with writing(path):
-            save_plan(context.tools.plan(context.cell, seed=seed, duration_s=self.duration_s), path)
+        plan = plan_moves(context, RUN, path, seed, self.duration_s)
         planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)
         context.operator.mount(planned)
-        record_valid(context, session, NextRun(planned, load_plan(path, context.cell)))
+        record_valid(context, session, NextRun(planned, plan))
         acceptance = judge_acceptance(context, session)
         level = Level.NOTICE if acceptance.accepted else Level.ERROR
         context.journal.say(level, "accepted" if acceptance.accepted else "not accepted", text=acceptance.remark)
@@ -105,7 +103,7 @@ def axis_scales(found: Validation) -> list[tuple[float, float]]:
 
 
 def _predicted(calibration: Calibration, context: SessionContext, session: Session) -> Validation:
-    (found,) = validate(calibration, [log_of(session, RUN)], context.cell)
+    (found,) = context.tools.validate(calibration, [log_of(session, RUN)], context.cell)
     return found
 
 

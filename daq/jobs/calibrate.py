@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from io import StringIO
 from pathlib import Path
 
 from daq.config.cell import Cell, WeighedPayload
@@ -14,18 +15,17 @@ from daq.errors import ConfigurationInconsistent, DaqError
 from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
 from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, target_of
-from daq.jobs.guided import GuidedSettings, UntilPrecise
+from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Basis, Session
-from daq.jobs.stages import Decide, Identify, Record, Stage, Watch, run_stages
+from daq.jobs.stages import TO_DECISION, Stage, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError
 
-STAGES: tuple[Stage, ...] = (Record(), Identify(), Watch(), Decide(), Accept())
 RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
 
 
@@ -54,11 +54,17 @@ def calibrate(
         context = replace(context, journal=journal, began_s=tools.monotonic_s(), block_signals=block_signals)
         try:
             audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
-            session = run_stages(STAGES, context, session)
+            session = run_stages(stages_of(settings), context, session)
         except BaseException as error:
             report_failure(context, session.folder, error)
             raise
         return report_success(context, session)
+
+
+def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
+    """Return the stages of a guided session: those of the job, then the acceptance."""
+    rehearsal = (Rehearse(UntilPrecise(settings)),) if settings.rehearse else ()
+    return (*rehearsal, *TO_DECISION, Accept())
 
 
 def context_of(
@@ -68,7 +74,7 @@ def context_of(
     return SessionContext(cell_file, cell, settings, UntilPrecise(settings), operator, target_of(cell), tools, journal)
 
 
-def basis_of(cell: Cell) -> Basis:
+def session_basis(cell: Cell) -> Basis:
     """Return what a session must share with the present cell to be resumed; its plans are its own."""
     return Basis(cell.name, cell.digest, "")
 
@@ -79,10 +85,10 @@ def _resumed_or_new(context: SessionContext) -> Session:
     folder = context.settings.folder
     found = sessions.sessions(folder, context.cell.name)
     require_clock(found, now)
-    session = sessions.resumable_session(found, basis_of(context.cell), now, RESUME_WITHIN_H)
+    session = sessions.resumable_session(found, session_basis(context.cell), now, RESUME_WITHIN_H)
     if session is None:
         _say_why_new(context, found, now)
-        session = sessions.begin(folder, basis_of(context.cell), now, GuidedState)
+        session = sessions.begin(folder, session_basis(context.cell), now, GuidedState)
         context.journal.say(Level.NOTICE, "session begun", folder=str(session.folder))
         return session
     attempt = session.state.attempt + 1
@@ -118,7 +124,7 @@ class CheckLine:
     text: str  #: what was found; what to do where it did not pass
 
 
-def check(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
+def check_readiness(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
     """Check what a session needs, and predict what it can know; nothing moves, and nothing is written."""
     return (
         _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
@@ -136,7 +142,7 @@ def _checked(name: str, ask: Callable[[], str]) -> CheckLine:
         return CheckLine(name, False, str(error))
 
 
-def payload_of(cell: Cell, name: str | None) -> WeighedPayload:
+def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:
     """Return the body for the loaded blocks: the named one, or the only one of the cell.
 
     Raises:
@@ -159,7 +165,7 @@ def payload_of(cell: Cell, name: str | None) -> WeighedPayload:
 
 
 def _payload_text(cell: Cell, name: str | None) -> str:
-    payload = payload_of(cell, name)
+    payload = payload_for_blocks(cell, name)
     return f"{payload.name}, {payload.mass_kg:g} kg within {payload.mass_tolerance_kg:g} kg"
 
 
@@ -167,7 +173,8 @@ def _ready_text(context: SessionContext) -> str:
     folder = context.settings.folder
     there = next(path for path in (folder, *folder.parents) if path.is_dir())
     tools = replace(context.tools, free=lambda _: context.tools.free(there))
-    before_motion(replace(context, tools=tools), take_over=False)
+    quiet = replace(context.journal, stream=StringIO())
+    before_motion(replace(context, tools=tools, journal=quiet), take_over=False)
     return "free space, history readable, robot released, drives as declared and without power"
 
 

@@ -18,15 +18,18 @@ from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
+from daq.jobs.block_check import BlockFacts, look_at_block
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
+from daq.report.plan_preview import save_preview
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
+from daq.workflow.validate import Validation, validate
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
@@ -173,6 +176,20 @@ class Fitter(Protocol):
         """As `daq.workflow.fit.fit`."""
 
 
+class BlockReader(Protocol):
+    """Reads what the log of a block shows."""
+
+    def __call__(self, cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
+        """As `daq.jobs.block_check.look_at_block`."""
+
+
+class Validator(Protocol):
+    """Predicts logs with a calibration."""
+
+    def __call__(self, calibration: Calibration, logs: Sequence[Path], cell: Cell) -> tuple[Validation, ...]:
+        """As `daq.workflow.validate.validate`."""
+
+
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
@@ -184,17 +201,20 @@ class ChangeWriter(Protocol):
 class Tools:
     """Functions that a job calls; tests replace those whose result they know."""
 
-    save_report: Callable[[Fit, Account, Calibration, Path], None]  #: writes the report of a fit into a folder
+    save_report: Callable[[Fit, Account, Calibration, Path], object]  #: writes the report of a fit into a folder
     #: Checks the drives before anything moves, and takes over those of a killed recorder if the last argument says so.
     drives: Callable[[Cell, SignalBlocker, bool], None] = check_drives
     plan: Planner = plan
+    preview: Callable[[Cell, Plan, Path, Path], None] = save_preview  #: writes a page that shows a plan, from its file
     record: Recorder = record
+    look: BlockReader = look_at_block
     fit: Fitter = fit
     close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[[Evidence, Sequence[Step]], Account] = account
     propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
     apply: ChangeWriter = apply
+    validate: Validator = validate
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
     now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone

@@ -49,6 +49,14 @@ class Operator(Protocol):
             MotionRefused: nobody does.
         """
 
+    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+        """Decide whether a block is recorded again because of a mistake that it shows; else it stays as it is.
+
+        Args:
+            run: the block.
+            mistake: what was found and what to do.
+        """
+
     def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
         """Decide whether a change that passed all gates is written.
 
@@ -104,6 +112,10 @@ class CellPolicy:
         """Name policy and interlock; `section_of` has refused a cell without this permission."""
         return f"the policy of cell {self.cell.name} and its interlock, for {self.who}"
 
+    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+        """Yes: the mount command is asked once more."""
+        return True
+
     def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
         """Whether `policy: {apply: {by: job}}` lets the job write; what an operator changed since is left to one."""
         is_of_job = self.cell.apply.by is AppliedBy.JOB
@@ -133,6 +145,10 @@ class GivenAnswers:
     def permit_motion(self, run: PlannedRun) -> str:
         """Return who permitted it beforehand."""
         return self.granted_by
+
+    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+        """Yes: what it carries is mounted once more."""
+        return True
 
     def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
         """Approve what was approved beforehand, unless the file was changed since."""

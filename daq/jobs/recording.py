@@ -32,6 +32,7 @@ from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import summary
+from daq.report.residual_page import PAGE
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import release_check
 from daq.workflow.plan import Plan, load_plan, save_plan
@@ -86,17 +87,29 @@ def record_runs(context: SessionContext, session: Session) -> Session:
 
 
 def _warm_up(context: SessionContext, session: Session, run: NextRun) -> None:
-    """Make the moves of a run, recorded under the same supervision; the log is dropped."""
-    out = log_of(session, WARM_UP)
+    """Make the moves of a run for the warm-up."""
     seconds = run.plan.duration_s
     passes = math.ceil(60.0 * context.settings.warm_up_min / seconds)
     journal = context.within(WARM_UP).journal
     for number in range(1, passes + 1):
         journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=seconds)
-        out.unlink(missing_ok=True)
-        out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
-        _record(context, run, out)
-        out.unlink()
+        move_without_log(context, session, run)
+
+
+def move_without_log(context: SessionContext, session: Session, run: NextRun, speed: float = 1.0) -> None:
+    """Make the moves of a run, recorded under the same supervision; the log is dropped.
+
+    Args:
+        context: of the session.
+        session: in whose folder the log is meanwhile.
+        run: its moves.
+        speed: share of the planned speed at which these moves are.
+    """
+    out = log_of(session, WARM_UP)
+    out.unlink(missing_ok=True)
+    out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+    _record(context, run, out, speed)
+    out.unlink()
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +197,7 @@ def record_valid(context: SessionContext, session: Session, run: NextRun) -> Rec
     )
 
 
-def _record(context: SessionContext, run: NextRun, out: Path) -> Recorded:
+def _record(context: SessionContext, run: NextRun, out: Path, speed: float = 1.0) -> Recorded:
     """Make one recording; the interlock is checked before the drives are used, and again before they get power.
 
     Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
@@ -201,6 +214,7 @@ def _record(context: SessionContext, run: NextRun, out: Path) -> Recorded:
         operator=context.who,
         granted_by=context.operator.permit_motion(planned),
         run_id=str(uuid.uuid4()),
+        speed=speed,
         entered_kg=planned.mass_kg,
         unguarded=context.operator.unguarded,
     )
@@ -271,6 +285,7 @@ def fit_session(context: SessionContext, session: Session) -> Session:
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
     context.tools.save_report(closed, changed, calibration, report)
+    context.journal.say(Level.INFO, "certificate", page=str(report / PAGE))
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed, calibration.effects))
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence)

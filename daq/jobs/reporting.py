@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
@@ -24,8 +25,11 @@ from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.document import json_text
 from daq.report.job_schemas import JobReport, RefusedJob, SessionReport
+from daq.report.residual_page import PAGE
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
+
+AnyReport = TypeVar("AnyReport", JobReport, SessionReport)
 
 SUMMARY_TEXT = "summary.txt"
 SUMMARY_JSON = "summary.json"
@@ -112,7 +116,9 @@ def _report(
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        replace_file(session.folder / SUMMARY_JSON, json_text(conclusion_report(conclusion, context.file)).encode())
+        is_guided = isinstance(session.state, GuidedState)
+        report = session_report(conclusion, context.file) if is_guided else conclusion_report(conclusion, context.file)
+        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
     found = sessions.sessions(context.settings.folder, context.cell.name)
     if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -145,8 +151,17 @@ def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
 
-def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | SessionReport | RefusedJob:
+def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | RefusedJob:
     """Return how a job ended, for `recalibrate --json` and summary.json."""
+    return _as_report(JobReport, conclusion, cell_file)
+
+
+def session_report(conclusion: Conclusion, cell_file: Path) -> SessionReport | RefusedJob:
+    """Return how a guided session ended, for `calibrate --json` and summary.json."""
+    return _as_report(SessionReport, conclusion, cell_file)
+
+
+def _as_report(kind: type[AnyReport], conclusion: Conclusion, cell_file: Path) -> AnyReport | RefusedJob:
     refused = RefusedJob(
         outcome=conclusion.outcome,
         exit_code=conclusion.exit_code,
@@ -158,7 +173,6 @@ def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | Se
         return refused
     # Not strictly: what is a tuple in a state is a list in its mapping.
     values = {**session.state.model_dump(), **dict(refused), "folder": str(session.folder)}
-    kind = SessionReport if isinstance(session.state, GuidedState) else JobReport
     return kind.model_validate(values, strict=False)
 
 
@@ -197,11 +211,30 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
         drifts = [gain.alarm for gain in state.watched if gain.alarm]
         if drifts:
             lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
-        lines += ["", f"Folder: {session.folder}"]
-        if (session.folder / REPORT / "report.html").exists():
-            lines.append(f"Report: {session.folder / REPORT / 'report.html'}")
-    lines += ["", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
+    lines += _closing(conclusion, cell_file)
     return "\n".join(lines) + "\n"
+
+
+def ending(conclusion: Conclusion, cell_file: Path) -> str:
+    """Write the end of a session for a person who has seen how it went."""
+    lines = ["", f"Outcome: {conclusion.outcome.value}"]
+    session = conclusion.session
+    if session is not None and isinstance(session.state, GuidedState):
+        lines += _guided_lines(session.state)
+    lines += _closing(conclusion, cell_file)
+    return "\n".join(lines) + "\n"
+
+
+def _closing(conclusion: Conclusion, cell_file: Path) -> list[str]:
+    """List the files of a session and the next steps."""
+    lines: list[str] = []
+    session = conclusion.session
+    if session is not None:
+        lines += ["", f"Folder: {session.folder}"]
+        page = session.folder / REPORT / PAGE
+        if page.exists():
+            lines.append(f"Report: {page}")
+    return [*lines, "", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
 
 
 def _guided_lines(state: GuidedState) -> list[str]:

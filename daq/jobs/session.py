@@ -45,9 +45,8 @@ class Session:
 
     @property
     def finished(self) -> bool:
-        """Whether no job resumes it; a job that was killed before it reported its end did not finish it."""
-        outcome = self.state.outcome
-        return outcome is not None and outcome.concluded and self.state.ended is not None
+        """Whether no job resumes it."""
+        return self.state.is_over
 
     @property
     def last_written(self) -> datetime:

@@ -53,7 +53,7 @@ class Identify:
         return fit_session(context.within("fit"), session)
 
 
-class Watch:
+class WatchDrift:
     """Enter the calibration into the history, and look at the drift of each gain."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
@@ -84,6 +84,10 @@ class Decide:
         """See `daq.jobs.decision.decide_outcome`."""
         history = read_history(context.ledger)
         return decide_outcome(context.within("decide"), session, calibration_made(session), history)
+
+
+TO_DECISION: tuple[Stage, ...] = (Record(), Identify(), WatchDrift(), Decide())
+"""Stages of the scheduled job and of the demonstration; a guided session goes on with the acceptance."""
 
 
 def run_stages(stages: Sequence[Stage], context: SessionContext, session: Session) -> Session:
