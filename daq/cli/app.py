@@ -45,6 +45,12 @@ BY_JOB = {
             "Create a folder for a new cell, with templates to fill in.",
         ),
         Verb(
+            "calibrate",
+            "daq.cli.calibrate:calibrate_verb",
+            "drivegain calibrate press-4/cells/press-4.yaml --enable-motion",
+            "One session: check, record, identify, write, accept.",
+        ),
+        Verb(
             "scan", "daq.cli.scan:scan_verb", "drivegain scan CELL", "Compare the nodes on the bus with the cell file."
         ),
         Verb(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
 import sys
 from dataclasses import replace
@@ -70,17 +69,14 @@ def recalibrate_verb(
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
     from daq.documents.session_state import Outcome
+    from daq.jobs.certificate import save_certificate
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
     from daq.jobs.journal import Level
     from daq.jobs.reporting import conclusion_report, text
-    from daq.jobs.session import CALIBRATION
     from daq.log.feed import Feed
-    from daq.report.comparison import compare
     from daq.report.job_schemas import DryRunReport
-    from daq.report.residual_page import save_report
     from daq.workflow.record import record
-    from daq.writeback.request import Request
 
     declared = read_cell(cell)
     if now and declared.recalibration is not None:
@@ -90,10 +86,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         fits: list[tuple[Fit, Account, Calibration, Path]] = []
 
         def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
-            request = Request(calibration, datetime.now(UTC))
-            command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-            compared = compare(declared, request, command)
-            save_report(fitted, changed, calibration, folder, compared, session=folder.parent.name)
+            save_certificate(cell, declared, fitted, changed, calibration, folder)
             fits.append((fitted, changed, calibration, folder))
 
         tools = Tools(save_report=certify, record=partial(record, feed=feed))

@@ -13,7 +13,13 @@ from pydantic import Field
 
 from daq.config.cell_closures import ClosedChain, robot_with
 from daq.config.controller import Controller
-from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace, Permission
+from daq.config.policy import (
+    DEFAULT_APPLY_POLICY,
+    DEFAULT_TARGET_SIGMA_PERCENT,
+    ApplyPolicy,
+    HistoryPlace,
+    Permission,
+)
 from daq.config.recalibration import Recalibration
 from daq.config.workspace import Clearance
 from daq.config.yaml_file import FileName, Name
@@ -182,13 +188,14 @@ class Cell:
     folder: Path | None  #: folder of the cell file; None for a cell from a log
     digest: str  #: sha256 of the cell file and all files it refers to, hex
     #: sha256 of the content that a recording or its fit depends on, hex: without comments, and without the later use of
-    #: a calibration (`policy`, `history`, `recalibration`).
+    #: a calibration (`policy`, `history`, `recalibration`) and the end of a session (`target_sigma_percent`).
     recording_digest: str
     motion: MotionPolicy = MotionPolicy.ASK  #: permission of a scheduled job to move the axes
     #: Permission of a job to move axes that go on moving when it is killed.
     unguarded: Permission = Permission.REFUSED
     recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
+    target_sigma_percent: float = DEFAULT_TARGET_SIGMA_PERCENT  #: σ of every gain at which a guided session ends [%]
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
     recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
     chain: ClosedChain | None = None  #: how the loops of a closed chain close; None of a serial robot

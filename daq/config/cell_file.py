@@ -102,6 +102,7 @@ def cell_from_bundle(
         unguarded=model.policy.unguarded,
         recovery_motion=model.policy.recovery_motion,
         apply=model.policy.apply,
+        target_sigma_percent=model.target_sigma_percent,
         history=None if file is None else model.history.place(file, controller),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
     )
@@ -116,8 +117,8 @@ def digest(files: Mapping[str, bytes]) -> str:
     return total.hexdigest()
 
 
-_AFTERWARDS = ("policy", "history", "recalibration")
-"""Keys for the use of a calibration; no recording and no fit depends on them."""
+_AFTERWARDS = ("policy", "history", "recalibration", "target_sigma_percent")
+"""Keys for the use of a calibration, and for the end of a recording; no recording and no fit depends on them."""
 _BOUNDS = ("rated_payload_kg",)
 """Keys of `robot` that only bound others; no recording and no fit depends on them."""
 _BESIDE = ("torque", "temperature")

@@ -17,7 +17,13 @@ from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sy
 from daq.config.cell_closures import ChainModel, ClosureModel
 from daq.config.controller import Controller
 from daq.config.document_kind import DocumentKind
-from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection, Permission
+from daq.config.policy import (
+    DEFAULT_APPLY_POLICY,
+    DEFAULT_TARGET_SIGMA_PERCENT,
+    ApplyPolicy,
+    HistorySection,
+    Permission,
+)
 from daq.config.recalibration import RecalibrationSection
 from daq.config.workspace import ClearanceSection, WorkspaceSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
@@ -271,6 +277,9 @@ class CellModel(StrictModel):
     controller: Controller | None = None
     workspace: WorkspaceSection | None = None
     clearance: ClearanceSection | None = None
+    target_sigma_percent: Annotated[
+        float, Field(description="σ of every gain at which `calibrate` ends its recording [%].", ge=0.05, le=10.0)
+    ] = DEFAULT_TARGET_SIGMA_PERCENT
     policy: PolicyModel = PolicyModel()
     history: HistorySection = HistorySection()
     recalibration: RecalibrationSection | None = None

@@ -75,6 +75,7 @@ class ApplyPolicy:
 
 
 DEFAULT_APPLY_POLICY = ApplyPolicy()
+DEFAULT_TARGET_SIGMA_PERCENT = 0.5  #: σ of every gain at which a guided session ends
 
 
 def max_change_faults(policy: ApplyPolicy, axes: Collection[str]) -> Iterator[Fault]:

@@ -380,7 +380,7 @@ function showResults(found) {
   }
   if (found.session) {
     const { session } = found;
-    parts.push(element("h3", `Scheduled recalibration ${session.session}: ${session.outcome}`));
+    parts.push(element("h3", `${session.kind} ${session.session}: ${session.outcome}`));
     session.sentences.forEach((text) => parts.push(element("p", text)));
     if (session.waits) parts.push(element("p", "A proposal waits for approval. Type in a terminal:", "alarm"));
     else if (session.problem) parts.push(prose("p", session.problem));
@@ -402,6 +402,66 @@ function showResults(found) {
   byId("results").replaceChildren(...parts);
 }
 
+// ---- A guided session
+
+function drawn(tag, attributes, text) {
+  const made = document.createElementNS(byId("precision").namespaceURI, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+/** σ of each gain over the time of motion, both axes logarithmic: a fall as 1/√time is a straight line. */
+function drawPrecision(guided) {
+  const { progress, axes, target_percent: target } = guided;
+  const [width, height, left, right, top, bottom] = [640, 260, 48, 70, 12, 32];
+  const times = progress.map((one) => one.motion_s);
+  const values = [target, ...progress.flatMap((one) => one.std_percent)];
+  const [first, last] = [times[0], Math.max(times[0] * 2, times.at(-1) + (guided.left_s || 0))];
+  const [low, high] = [Math.min(...values) / 1.3, Math.max(...values) * 1.3];
+  const x = (time) => left + (width - left - right) * Math.log(time / first) / Math.log(last / first);
+  const y = (value) => top + (height - top - bottom) * Math.log(high / value) / Math.log(high / low);
+  const picture = byId("precision");
+  picture.replaceChildren(drawn("title", {}, `Standard deviation of each gain after ${progress.length} looks; target ${target} %`));
+  for (const value of [0.1, 0.2, 0.5, 1, 2, 5, 10, 20].filter((one) => one > low && one < high)) {
+    picture.append(drawn("line", { class: "grid", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
+    picture.append(drawn("text", { x: left - 6, y: y(value) + 4, "text-anchor": "end" }, `${value} %`));
+  }
+  picture.append(drawn("line", { class: "target", x1: left, x2: width - right, y1: y(target), y2: y(target) }));
+  const ends = axes.map((name, k) => ({ name, k, value: progress.at(-1).std_percent[k] })).sort((a, b) => b.value - a.value);
+  let free = 0;
+  for (const { name, k, value } of ends) {
+    const points = progress.map((one) => `${x(one.motion_s)},${y(one.std_percent[k])}`).join(" ");
+    const kind = value > target ? "sigma coarse" : "sigma";
+    picture.append(drawn("polyline", { class: kind, points }));
+    picture.append(drawn("circle", { class: kind, cx: x(times.at(-1)), cy: y(value), r: 3 }));
+    free = Math.max(y(value) + 4, free + 14); // names do not cover each other
+    picture.append(drawn("text", { x: x(times.at(-1)) + 8, y: free }, `${name} ${number(value, 2)} %`));
+  }
+  for (const time of [first, times.at(-1)]) {
+    picture.append(drawn("text", { x: x(time), y: height - 8, "text-anchor": "middle" }, `${Math.round(time)} s`));
+  }
+}
+
+function showGuided(guided) {
+  byId("guided").hidden = !guided;
+  if (!guided) return;
+  byId("stage").textContent = `Stage: ${guided.stage}. Recorded: ${guided.blocks.join(", ") || "nothing yet"}.`;
+  byId("next-step").textContent = guided.next_step;
+  const parts = [];
+  byId("precision").toggleAttribute("hidden", !guided.progress.length);
+  if (guided.progress.length) drawPrecision(guided);
+  if (guided.missing) parts.push(element("p", `Not reached: ${guided.missing}`, "alarm"));
+  else if (guided.stage === "record" && guided.left_s) {
+    parts.push(element("p", `About ${Math.round(guided.left_s)} s of motion are left, if σ falls with the root of the time.`));
+  }
+  if (guided.acceptance) {
+    const verdict = guided.accepted ? "Accepted" : "Not accepted";
+    parts.push(element("p", `${verdict}: ${guided.acceptance}`, guided.accepted ? "" : "alarm"));
+  }
+  byId("outlook").replaceChildren(...parts);
+}
+
 let before = "";
 async function look() {
   try {
@@ -409,7 +469,10 @@ async function look() {
     const found = JSON.parse(text);
     // The stop is shown by this way too: the curves may be stalled.
     if (found.stop) showStop(found.stop);
-    if (text !== before && "problems" in found) showResults(found);
+    if (text !== before && "problems" in found) {
+      showResults(found);
+      showGuided(found.guided);
+    }
     before = text;
   } catch { /* the stream reports it */ }
   setTimeout(look, 1000);

@@ -12,8 +12,10 @@ from typing import Any
 
 from daq.config.cell import Cell
 from daq.documents.calibration_file import load_calibration
-from daq.documents.session_state import Outcome
+from daq.documents.session_state import GuidedState, Outcome
 from daq.errors import DaqError, ExitCode
+from daq.jobs.guided import left_s
+from daq.jobs.position import position_of, sessions_folder
 from daq.jobs.reporting import Conclusion, to_do
 from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
 from daq.ledger.ledger import MAY_LACK, Ledger, read_history
@@ -64,7 +66,12 @@ class Results:
         """Return everything for the page; a file that cannot be read is a sentence in `problems`."""
         problems: list[str] = []
         found: dict[str, Any] = {"problems": problems, "report": self._report_path() is not None}
-        for name, read in (("gains", self._gains), ("history", self._history), ("session", self._session)):
+        for name, read in (
+            ("gains", self._gains),
+            ("history", self._history),
+            ("session", self._session),
+            ("guided", self._guided),
+        ):
             try:
                 found[name] = read()
             except UNREADABLE as error:
@@ -74,8 +81,17 @@ class Results:
         return found
 
     def _newest(self) -> Session | None:
+        """Return the session of the job or of `calibrate` that was begun last; None without either."""
+        newest = [one for one in (self._newest_job(), self._newest_guided()) if one is not None]
+        return max(newest, key=lambda session: session.began, default=None)
+
+    def _newest_job(self) -> Session | None:
         section = self._cell.recalibration
         past = () if section is None else sessions(section.folder, self._cell.name)
+        return past[-1] if past else None
+
+    def _newest_guided(self) -> Session | None:
+        past = sessions(sessions_folder(self._cell_file), self._cell.name)
         return past[-1] if past else None
 
     def _report_path(self) -> Path | None:
@@ -125,6 +141,28 @@ class Results:
             "command": f"drivegain history {shlex.quote(str(self._cell_file))}",
         }
 
+    def _guided(self) -> dict[str, Any] | None:
+        """Return where the newest session of `calibrate` is, and σ of each gain after each block."""
+        newest = self._newest_guided()
+        if newest is None or not isinstance(newest.state, GuidedState):
+            return None
+        state = newest.state
+        position = position_of(state)
+        motion_s = state.progress[-1].motion_s if state.progress else 0.0
+        return {
+            "session": state.session,
+            "stage": position.stage.value,
+            "next_step": position.next_step,
+            "blocks": [run.name for run in state.runs],
+            "axes": [gain.axis for gain in state.gains],
+            "target_percent": state.gains[0].target_percent if state.gains else None,
+            "progress": [{"motion_s": one.motion_s, "std_percent": list(one.std_percent)} for one in state.progress],
+            "left_s": left_s(state.gains, motion_s) if state.gains else None,
+            "missing": state.missing,
+            "acceptance": None if state.acceptance is None else state.acceptance.remark,
+            "accepted": None if state.acceptance is None else state.acceptance.accepted,
+        }
+
     def _session(self) -> dict[str, Any] | None:
         newest = self._newest()
         if newest is None:
@@ -136,6 +174,7 @@ class Results:
             ended = Conclusion(outcome, state.exit_code or ExitCode.OK, newest, state.problem)
         return {
             "session": state.session,
+            "kind": "Session" if isinstance(state, GuidedState) else "Scheduled recalibration",
             "outcome": "not finished" if outcome is None else outcome.value,
             "waits": outcome is Outcome.PROPOSED,
             "problem": state.problem,

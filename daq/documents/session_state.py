@@ -1,4 +1,4 @@
-"""The state of a recalibration session: what `state.json` in its folder says of the steps that are done."""
+"""The state of a session: what `state.json` in its folder says of the stages that are done."""
 
 from __future__ import annotations
 
@@ -114,6 +114,87 @@ class SessionState(StrictModel):
     ended: str | None = None
     audit_sha256: str | None = None  #: of the audit entry about the end of the session
 
+    @property
+    def is_over(self) -> bool:
+        """Whether no command goes on with it; a command that was killed before it reported its end did not end it."""
+        return self.outcome is not None and self.outcome.concluded and self.ended is not None
+
     def with_(self, **changed: object) -> SessionState:
         """A copy with other values."""
         return self.model_copy(update=changed)
+
+
+class Block(StrictModel):
+    """A run of a guided session, as it was decided before it was recorded."""
+
+    name: str  #: of its log
+    payload: str | None  #: what it carries, None without load
+    mass_kg: float | None  #: None without load
+    holdout: bool  #: not used by the fit
+    plan: str  #: file name of its moves
+
+
+class GainSoFar(StrictModel):
+    """A gain after a block, beside its target."""
+
+    axis: str
+    unit: str
+    value: float
+    std_percent: float
+    target_percent: float
+
+    @property
+    def is_precise(self) -> bool:
+        """Whether its σ is at the target."""
+        return self.std_percent <= self.target_percent
+
+
+class Progress(StrictModel):
+    """σ of all gains after a number of blocks."""
+
+    blocks: _Count
+    motion_s: float  #: of these blocks
+    std_percent: tuple[float, ...]  #: of each gain
+
+
+class ScaleOfAxis(StrictModel):
+    """Measured over predicted torque of a joint on new moves: 1 where its gain is right."""
+
+    axis: str
+    old: float  #: with the gain that the controller had
+    new: float  #: with the one that was written
+    std: float  #: σ of the new one
+
+
+class Acceptance(StrictModel):
+    """The short run after the write: torques of the currents beside those that the calibration predicts."""
+
+    log_sha256: str
+    scales: tuple[ScaleOfAxis, ...]
+    old_error_percent: float  #: of all axes
+    new_error_percent: float
+    accepted: bool
+    remark: str
+
+
+class GuidedState(SessionState):
+    """`state.json` of a guided session."""
+
+    format: Literal["drivegain-session"] = "drivegain-session"  # type: ignore[assignment]  # another kind of session
+    blocks: tuple[Block, ...] = ()
+    mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
+    rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
+    gains: tuple[GainSoFar, ...] = ()  #: after the last block that was judged
+    judged_blocks: _Count = 0  #: number of blocks behind these gains
+    progress: tuple[Progress, ...] = ()  #: after each block that was judged
+    checked_blocks: _Count = 0  #: number of blocks in which mistakes were looked for
+    repeated: tuple[str, ...] = ()  #: names of blocks that were recorded again because of a mistake, once each time
+    complete: bool = False  #: nothing is left to record
+    missing: str = ""  #: what was not reached when the recording ended, in words
+    acceptance: Acceptance | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no command goes on with it: what was written must be accepted, too."""
+        lacks_acceptance = self.outcome is Outcome.APPLIED and self.acceptance is None
+        return super().is_over and not lacks_acceptance

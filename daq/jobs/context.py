@@ -1,4 +1,4 @@
-"""Context of a recalibration job, and the checks before it begins and before it moves anything.
+"""What the stages of a session share, and the checks before it begins and before it moves anything.
 
 The last of them takes over the drives that a killed recorder has left with power.
 """
@@ -16,16 +16,20 @@ from typing import Protocol
 from daq.config.cell import Cell, MotionPolicy
 from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
-from daq.config.recalibration import Recalibration
+from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
+from daq.jobs.block_check import BlockFacts, look_at_block
 from daq.jobs.journal import Journal, Level
+from daq.jobs.operator import Operator
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
+from daq.report.plan_preview import save_preview
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
 from daq.workflow.plan import Plan, plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
+from daq.workflow.validate import Validation, validate
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
@@ -45,9 +49,9 @@ CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
 
 
 # A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop when it stays away,
-# so a job waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE (605Ah = 5
-# to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed recorder
-# belongs to another controller: it is left alone.
+# so a session waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE
+# (605Ah = 5 to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed
+# recorder belongs to another controller: it is left alone.
 
 FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 LEFT = (State.QUICK_STOP_ACTIVE, State.SWITCHED_ON)  #: States of power without a motion that a killed recorder leaves
@@ -172,6 +176,20 @@ class Fitter(Protocol):
         """As `daq.workflow.fit.fit`."""
 
 
+class BlockReader(Protocol):
+    """Reads what the log of a block shows."""
+
+    def __call__(self, cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
+        """As `daq.jobs.block_check.look_at_block`."""
+
+
+class Validator(Protocol):
+    """Predicts logs with a calibration."""
+
+    def __call__(self, calibration: Calibration, logs: Sequence[Path], cell: Cell) -> tuple[Validation, ...]:
+        """As `daq.workflow.validate.validate`."""
+
+
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
@@ -183,17 +201,20 @@ class ChangeWriter(Protocol):
 class Tools:
     """Functions that a job calls; tests replace those whose result they know."""
 
-    save_report: Callable[[Fit, Account, Calibration, Path], None]  #: writes the report of a fit into a folder
+    save_report: Callable[[Fit, Account, Calibration, Path], object]  #: writes the report of a fit into a folder
     #: Checks the drives before anything moves, and takes over those of a killed recorder if the last argument says so.
     drives: Callable[[Cell, SignalBlocker, bool], None] = check_drives
     plan: Planner = plan
+    preview: Callable[[Cell, Plan, Path, Path], None] = save_preview  #: writes a page that shows a plan, from its file
     record: Recorder = record
+    look: BlockReader = look_at_block
     fit: Fitter = fit
     close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[[Evidence, Sequence[Step]], Account] = account
     propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
     apply: ChangeWriter = apply
+    validate: Validator = validate
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
     now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone
@@ -209,19 +230,89 @@ class GainTarget:
     history: HistoryPlace  #: files of history and audit
 
 
+class SessionSettings(Protocol):
+    """Limits and places of a session; the cell's `recalibration` has them for a job."""
+
+    @property
+    def folder(self) -> Path:
+        """Parent of the sessions, each with logs, state and report; absolute."""
+
+    @property
+    def warm_up_min(self) -> float:
+        """Duration of the moves before the first run, which are not logged [min]."""
+
+    @property
+    def retries(self) -> int:
+        """Further attempts of a run that its recorder marked invalid."""
+
+    @property
+    def min_free_mb(self) -> float:
+        """Free space on the disk that is required at the start [MB]."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the significance test."""
+
+    @property
+    def keep_sessions(self) -> int:
+        """Number of ended sessions whose logs are kept."""
+
+    @property
+    def metrics(self) -> Path | None:
+        """Folder of Prometheus' textfile collector, None without one."""
+
+
 @dataclass(frozen=True, slots=True)
-class JobContext:
-    """Everything that the steps of a job share."""
+class NextRun:
+    """The next recording of a session."""
+
+    planned: PlannedRun  #: its name and payload
+    plan: Plan  #: its moves
+
+
+class Schedule(Protocol):
+    """Which runs a session consists of: those of the cell file, or blocks until every gain is precise."""
+
+    def prepare(self, context: SessionContext, session: Session) -> Session:
+        """Make what the first runs need, before anything moves."""
+
+    def runs(self, session: Session) -> tuple[PlannedRun, ...]:
+        """Return the runs that are known so far, recorded or not, in their order."""
+
+    def is_complete(self, session: Session) -> bool:
+        """Whether nothing is left to record; the recorded runs of the session are verified."""
+
+    def next_run(self, context: SessionContext, session: Session) -> tuple[Session, NextRun | None]:
+        """Decide the next run; None where the session has what it needs. The decision is in the session's state.
+
+        Args:
+            context: of the session.
+            session: its recorded runs are verified.
+        """
+
+    def after_run(self, context: SessionContext, session: Session) -> Session:
+        """Judge what was recorded so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionContext:
+    """Everything that the stages of a session share."""
 
     file: Path  #: cell file
     cell: Cell  #: read from it
-    section: Recalibration  #: its `recalibration`
+    settings: SessionSettings  #: limits and places of the session
+    schedule: Schedule  #: which runs it consists of
+    operator: Operator  #: who mounts, permits motion and approves
     target: GainTarget  #: controller file that the gains are compared with and written to
-    tools: Tools  #: functions that the job calls
-    journal: Journal  #: log of the job, labelled with session and step
-    who: str  #: name of the job in audit and logs
-    began_s: float = 0.0  #: start of the job on the monotonic clock [s]
+    tools: Tools  #: functions that the stages call
+    journal: Journal  #: log of the session, labelled with session and stage
+    began_s: float = 0.0  #: start on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
+
+    @property
+    def who(self) -> str:
+        """Name of the operator in audit and logs."""
+        return self.operator.who
 
     @property
     def ledger(self) -> Ledger:
@@ -229,9 +320,9 @@ class JobContext:
         place = self.target.history
         return Ledger(self.cell, place.audit, place.store)
 
-    def within(self, step: str) -> JobContext:
-        """The same context, with a journal that names the step."""
-        return replace(self, journal=replace(self.journal, step=step))
+    def within(self, stage: str) -> SessionContext:
+        """The same context, with a journal that names the stage."""
+        return replace(self, journal=replace(self.journal, step=stage))
 
 
 def target_of(cell: Cell) -> GainTarget:
@@ -313,7 +404,7 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
         )
 
 
-def before_motion(context: JobContext, *, take_over: bool = True) -> None:
+def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
     """Check disk space, history, interlock and drives.
 
     Args:
@@ -324,15 +415,15 @@ def before_motion(context: JobContext, *, take_over: bool = True) -> None:
         DiskSpaceShort, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder is gone.
     """
-    section = context.section
+    settings = context.settings
     tools = context.tools
-    with writing(section.folder):
-        free_mb = tools.free(section.folder) / 1e6
-    if free_mb < section.min_free_mb:
+    with writing(settings.folder):
+        free_mb = tools.free(settings.folder) / 1e6
+    if free_mb < settings.min_free_mb:
         raise DiskSpaceShort(
-            str(section.folder),
+            str(settings.folder),
             found=f"{free_mb:.0f} MB free",
-            expected=f"{section.min_free_mb:g} MB (min_free_mb)",
+            expected=f"{settings.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
     read_history(context.ledger)  # the gains are compared with it: unreadable now is better than after the recordings

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -13,34 +12,20 @@ from pathlib import Path
 from types import FrameType
 
 from daq.config.cell import Cell
-from daq.config.policy import AppliedBy
 from daq.config.recalibration import Recalibration
-from daq.documents.calibration_file import read_calibration_bytes
-from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite, WatchedGain
-from daq.errors import ExitCode, TimeBoundReached, writing
-from daq.files import replace_file, sha256, sha256_of
+from daq.documents.session_state import Outcome
+from daq.errors import ExitCode, TimeBoundReached
 from daq.jobs import session as sessions
-from daq.jobs.context import JobContext, Tools, before_motion, require_clock, section_of, target_of
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of, target_of
 from daq.jobs.journal import Journal, Level
-from daq.jobs.recording import basis_of, calibration_of_session, fit_session, record_runs, verified_runs
+from daq.jobs.operator import CellPolicy
+from daq.jobs.recording import FixedRuns, basis_of, calibration_of_session, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
-from daq.jobs.session import CALIBRATION, Session
+from daq.jobs.session import Session
+from daq.jobs.stages import TO_DECISION, run_stages
 from daq.ledger.audit import AuditAction
-from daq.ledger.audit import read as read_audit
-from daq.ledger.fold import History
-from daq.ledger.ledger import MAY_LACK, enter_calibration, read_history, record_session
-from daq.ledger.watch import alarm_text, watch
-from daq.report.document import json_text
-from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
 from daq.workflow.bus_lock import bus_lock
-from daq.writeback.file_access import resolve_links
-from daq.writeback.file_target import FileEdit, FileTarget
-from daq.writeback.gates.gate import Gate
-from daq.writeback.judgement import Spread, judge, known_of
-from daq.writeback.request import GainChange, Request
-from daq.writeback.target import Proposal, Written
 from drivers.canopen.network import SignalBlocker
-from ident.calibration import Calibration
 
 
 def recalibrate(
@@ -61,7 +46,7 @@ def recalibrate(
             controller's file is unchanged, and audit, state, metrics and summary report it.
     """
     section = section_of(cell)
-    target = target_of(cell)
+    context = _context(cell_file, cell, tools, journal, who)
     if (early := _not_due(section, cell, tools.now())) is not None:
         journal.say(Level.INFO, "not due", remark=early.remark)
         return early
@@ -69,10 +54,9 @@ def recalibrate(
         # Another job may have ended since.
         if (early := _not_due(section, cell, tools.now())) is not None:
             return early
-        began_s = tools.monotonic_s()
         session = _resumed_or_new(section, cell, tools.now(), journal)
         journal = replace(journal, session=session.state.session)
-        context = JobContext(cell_file, cell, section, target, tools, journal, who, began_s)
+        context = replace(context, journal=journal, began_s=tools.monotonic_s())
         try:
             audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
             with time_bound(section.max_duration_min) as in_time:
@@ -82,7 +66,7 @@ def recalibrate(
                     with block_signals() as asked_again, in_time():
                         yield asked_again
 
-                session = _run(replace(context, block_signals=block_both), session)
+                session = run_stages(TO_DECISION, replace(context, block_signals=block_both), session)
         except BaseException as error:
             report_failure(context, session.folder, error)
             raise
@@ -106,7 +90,7 @@ def preview(
         the errors of `recalibrate` up to the first motion.
     """
     section = section_of(cell)
-    target = target_of(cell)
+    context = _context(cell_file, cell, tools, journal, who)
     now = tools.now()
     if (early := _not_due(section, cell, now)) is not None:
         return Preview((), early.remark)
@@ -117,7 +101,7 @@ def preview(
         if left:
             folder = next((path for path in (section.folder, *section.folder.parents) if path.is_dir()), section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
-            before_motion(JobContext(cell_file, cell, section, target, there, journal, who), take_over=False)
+            before_motion(replace(context, tools=there), take_over=False)
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
@@ -127,26 +111,20 @@ def preview(
     return Preview(tuple(steps), taken)
 
 
-def _run(context: JobContext, session: Session) -> Session:
-    """Take the steps that the session lacks; returns it with its outcome."""
-    if len(verified_runs(session).state.runs) < len(context.section.runs):
-        before_motion(context.within("preflight"))
-        session = record_runs(context, session)
-    session, calibration = fit_session(context.within("fit"), session)
-    digest = sha256_of(session.folder / sessions.CALIBRATION) or ""
-    # Before the decision: what is only proposed is in the history, too. This also ends the write of a killed job.
-    enter_calibration(context.ledger, calibration, digest=digest, who=context.who, at=context.tools.now())
-    history = read_history(context.ledger)
-    if history.may_lack:
-        context.within("watch").journal.say(Level.WARNING, "history may be incomplete", text=MAY_LACK)
-    series = watch(history.entries, history.acknowledgements)
-    watched = tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
-    session = session.update(watched=watched)
-    for gain in watched:
-        if gain.alarm:
-            # Each slice of a slow drift may be small enough to be written without an operator.
-            context.within("watch").journal.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
-    return decide_outcome(context.within("decide"), session, calibration, history)
+def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: str) -> SessionContext:
+    """What the stages share in a job: the runs of the cell file, and its policy as the operator."""
+    section = section_of(cell)
+    return SessionContext(
+        cell_file,
+        cell,
+        section,
+        FixedRuns(section.runs),
+        CellPolicy(cell, section, who, tools.run),
+        target_of(cell),
+        tools,
+        journal,
+        began_s=tools.monotonic_s(),
+    )
 
 
 def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
@@ -187,158 +165,6 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
         problem="",
         ended=None,
     )
-
-
-CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
-PROPOSAL = "proposal.json"
-DIFF = "proposal.diff"
-
-
-def decide_outcome(context: JobContext, session: Session, calibration: Calibration, history: History) -> Session:
-    """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
-
-    Raises:
-        CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
-        AuditUnusable, OutputFailed: see `daq.writeback.target`.
-    """
-    path = session.folder / CALIBRATION
-    now = context.tools.now()
-    digest = sha256_of(path) or ""
-    before = session.state.target
-    if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
-        # The job was killed right after its write: the history has it by now, and it is never repeated.
-        words = "the controller's file has these gains already: an earlier job of this session wrote it"
-        context.journal.say(Level.NOTICE, words)
-        return session.update(outcome=Outcome.APPLIED)
-    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    proposal = context.tools.propose(FileTarget.of(context.cell), request)
-    edit = proposal.edit
-    decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))
-    differs = any(gain.differs for gain in decision.gains)
-    touched = _written_since(context, session)
-    if differs and touched:
-        decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
-    context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
-    after = sha256(edit.after)
-    target = PlannedWrite(
-        file=str(edit.file),
-        base_sha256=edit.base_sha256,
-        after_sha256=after,
-        looked_at=edit.base,
-        unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
-    )
-    _write_proposal(session, proposal, after)
-    # Before anything is written: after a kill, the digest of the file shows whether it was.
-    session = session.update(decision=decision, target=target)
-    closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
-    if closed:
-        for refusal in closed:
-            context.journal.say(Level.ERROR, "a check failed", gate=refusal.gate.value, text=str(refusal))
-        session.update(outcome=Outcome.REFUSED)
-        _apply(context, proposal, now)  # which refuses it, and writes that down
-    if not edit.has_effect or not differs:
-        return session.update(outcome=Outcome.UNCHANGED)
-    # An operator writes drives, whatever the policy says.
-    needs_person = context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
-    if proposal.refusals or needs_person or touched:
-        record_session(
-            context.target.history.audit,
-            AuditAction.PROPOSED,
-            at=context.tools.now(),
-            who=context.who,
-            subject=str(resolve_links(context.target.file)),
-            details={
-                "session": session.state.session,
-                "calibration_sha256": digest,
-                "sha256_before": target.base_sha256,
-                "sha256_after": after,
-            },
-        )
-        context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
-        return session.update(outcome=Outcome.PROPOSED)
-    written = _apply(context, proposal, now)
-    if written is not None:
-        context.journal.say(
-            Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup)
-        )
-        if written.not_in_history:
-            words = "the history does not have this write; the next job, apply or history --add enters it"
-            context.journal.say(Level.WARNING, words, text=written.not_in_history)
-    return session.update(outcome=Outcome.APPLIED)
-
-
-def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
-    with writing(proposal.edit.file):
-        return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
-
-
-def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
-    """Judge which gains differ significantly from the controller's (`daq.writeback.judgement`), each among all axes."""
-    judged, words = judge(proposal.edit.changes, known)
-    gains = tuple(
-        JudgedGain(
-            axis=change.axis,
-            unit=change.unit,
-            old=change.old,
-            new=change.new,
-            old_std=known.stds[change.axis],
-            new_std=change.std,
-            change_percent=_finite(judged[change.axis].percent),
-            drift_sigma=_finite(judged[change.axis].sigmas),
-            differs=judged[change.axis].significant,
-        )
-        for change in proposal.edit.changes
-        if change.axis in judged
-    )
-    return Decision(gains=gains, remark=words)
-
-
-def _written_since(context: JobContext, session: Session) -> bool:
-    """Whether the audit has a write or a rollback of the controller's file since the session began.
-
-    An earlier job may have been killed right after its write, and an operator may have undone that since. The file is
-    then as it was before, and the job must not repeat the write.
-    """
-    entries = read_audit(context.target.history.audit)
-    begun = [
-        index
-        for index, entry in enumerate(entries)
-        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
-    ]
-    file = str(resolve_links(context.target.file))
-    ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
-    # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
-    return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
-
-
-def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
-    """Write the change beside the calibration, as JSON and as a diff."""
-    report = ProposalReport(
-        file=str(proposal.edit.file),
-        base_sha256=proposal.edit.base_sha256,
-        after_sha256=after_sha256,
-        changes=[_proposed_gain(change) for change in proposal.edit.changes],
-        refusals=[FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals],
-    )
-    with writing(session.folder / PROPOSAL):
-        replace_file(session.folder / PROPOSAL, json_text(report).encode())
-        replace_file(session.folder / DIFF, proposal.edit.diff.encode())
-
-
-def _proposed_gain(change: GainChange) -> ProposedGain:
-    return ProposedGain(
-        axis=change.axis,
-        key=change.key,
-        old=change.old,
-        new=change.new,
-        std=change.std,
-        unit=change.unit,
-        change_percent=change.change_percent,
-    )
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
 
 
 AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason

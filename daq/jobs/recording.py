@@ -7,11 +7,10 @@ import math
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.config.policy import Permission
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.documents.session_state import Fitted, Outcome, RecordedRun
@@ -21,28 +20,27 @@ from daq.errors import (
     CalibrationUnreadable,
     ConfigurationError,
     DataError,
-    JobHeld,
     LogUnreadable,
     RunInvalid,
     writing,
 )
 from daq.files import sha256_of
-from daq.jobs.context import JobContext
+from daq.jobs.context import NextRun, SessionContext
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import summary
+from daq.report.residual_page import PAGE
 from daq.workflow.fit import check_holdout
-from daq.workflow.interlock import Runner, release_check
+from daq.workflow.interlock import release_check
 from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
 WARM_UP = "warm-up"
-NOTHING = "none"  #: Argument of the mount command for a run without load
 
 
 def log_of(session: Session, name: str) -> Path:
@@ -62,7 +60,7 @@ def verified_runs(session: Session) -> Session:
     return replace(session, state=session.state.with_(runs=runs))
 
 
-def record_runs(context: JobContext, session: Session) -> Session:
+def record_runs(context: SessionContext, session: Session) -> Session:
     """Make the recordings that the session lacks; its state is written after each of them.
 
     Raises:
@@ -70,76 +68,112 @@ def record_runs(context: JobContext, session: Session) -> Session:
         RunInvalid: every recording of a run was invalid.
         DriverError, OutputFailed, ConfigurationError: see `daq.workflow.record`.
     """
-    session = verified_runs(session)
-    made = {run.name for run in session.state.runs}
-    left = [planned for planned in context.section.runs if planned.name not in made]
-    plans = {planned.name: _plan(context.within("plan"), session, planned) for planned in left}
-    warm = not left
-    for planned in left:
+    session = context.schedule.prepare(context, verified_runs(session))
+    is_warm = False
+    while True:
+        session, run = context.schedule.next_run(context, session)
+        if run is None:
+            return session
+        planned = run.planned
         run_context = context.within(f"record {planned.name}")
-        mount(context.section, planned, context.tools.run)
+        context.operator.mount(planned)
         run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
-        if not warm:
-            # The moves of the run, recorded under the same supervision; the log is dropped.
-            plan = plans[planned.name]
-            out = log_of(session, WARM_UP)
-            passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
-            for number in range(1, passes + 1):
-                said = context.within(WARM_UP).journal
-                said.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
-                out.unlink(missing_ok=True)
-                out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
-                _record(context, planned, plan, out)
-                out.unlink()
-            warm = True
-        run = _record_valid(run_context, session, planned, plans[planned.name])
-        session = session.update(runs=(*session.state.runs, run))
-    return session
+        if not is_warm:
+            _warm_up(context, session, run)
+            is_warm = True
+        recorded = record_valid(run_context, session, run)
+        session = session.update(runs=(*session.state.runs, recorded))
+        session = context.schedule.after_run(context, session)
 
 
-def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
-    """Run the mount command for the payload of a run; before every run, also where nothing changes.
+def _warm_up(context: SessionContext, session: Session, run: NextRun) -> None:
+    """Make the moves of a run for the warm-up."""
+    seconds = run.plan.duration_s
+    passes = math.ceil(60.0 * context.settings.warm_up_min / seconds)
+    journal = context.within(WARM_UP).journal
+    for number in range(1, passes + 1):
+        journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=seconds)
+        move_without_log(context, session, run)
 
-    Raises:
-        JobHeld: the command did not end with 0, in its time.
+
+def move_without_log(context: SessionContext, session: Session, run: NextRun, speed: float = 1.0) -> None:
+    """Make the moves of a run, recorded under the same supervision; the log is dropped.
+
+    Args:
+        context: of the session.
+        session: in whose folder the log is meanwhile.
+        run: its moves.
+        speed: share of the planned speed at which these moves are.
     """
-    wanted = planned.payload or NOTHING
-    ended = run(section.mount, (wanted,), section.working_folder)
-    if ended.code != 0:
-        raise JobHeld(
-            f"mount command {section.mount.command[0]} {wanted}",
-            found=str(ended),
-            expected="exit code 0: it is mounted as the run needs it",
-            remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {planned.name}",
-        )
+    out = log_of(session, WARM_UP)
+    out.unlink(missing_ok=True)
+    out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+    _record(context, run, out, speed)
+    out.unlink()
 
 
-def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
-    """Load the approved plan, or make the plan of the seed once a session."""
-    if planned.plan_file is not None:
-        return load_plan(planned.plan_file, context.cell)
-    assert planned.plan is not None  # the schema requires one of the two
-    seed = planned.plan.seed
-    duration_s = planned.plan.duration_s
-    path = session.folder / f"plan-{seed}-{duration_s:g}s.yaml"
-    if path.exists():
-        with suppress(ConfigurationError):  # what was damaged is made again
-            return load_plan(path, context.cell)
-    context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-    with writing(path):
-        save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
-    return load_plan(path, context.cell)  # as a person can read it
+@dataclass(frozen=True, slots=True)
+class FixedRuns:
+    """The runs that the cell file lists, each with the plan that it names."""
+
+    listed: tuple[PlannedRun, ...]
+
+    def prepare(self, context: SessionContext, session: Session) -> Session:
+        """Make the plans of all runs that are left, before anything moves."""
+        for planned in self._left(session):
+            self._plan(context.within("plan"), session, planned)
+        return session
+
+    def runs(self, session: Session) -> tuple[PlannedRun, ...]:
+        """Return all of them, whatever was recorded."""
+        return self.listed
+
+    def is_complete(self, session: Session) -> bool:
+        """Whether each of them is recorded."""
+        return not self._left(session)
+
+    def next_run(self, context: SessionContext, session: Session) -> tuple[Session, NextRun | None]:
+        """Return the first one that is not recorded."""
+        for planned in self._left(session):
+            return session, NextRun(planned, self._plan(context.within("plan"), session, planned))
+        return session, None
+
+    def after_run(self, context: SessionContext, session: Session) -> Session:
+        """Judge nothing: all of them are recorded, whatever they show."""
+        return session
+
+    def _left(self, session: Session) -> list[PlannedRun]:
+        made = {run.name for run in session.state.runs}
+        return [planned for planned in self.listed if planned.name not in made]
+
+    def _plan(self, context: SessionContext, session: Session, planned: PlannedRun) -> Plan:
+        """Load the approved plan, or make the plan of the seed once a session."""
+        if planned.plan_file is not None:
+            return load_plan(planned.plan_file, context.cell)
+        assert planned.plan is not None  # the schema requires one of the two
+        seed = planned.plan.seed
+        duration_s = planned.plan.duration_s
+        path = session.folder / f"plan-{seed}-{duration_s:g}s.yaml"
+        if path.exists():
+            with suppress(ConfigurationError):  # what was damaged is made again
+                return load_plan(path, context.cell)
+        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+        with writing(path):
+            save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
+        return load_plan(path, context.cell)  # as a person can read it
 
 
-def _record_valid(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> RecordedRun:
+def record_valid(context: SessionContext, session: Session, run: NextRun) -> RecordedRun:
     """Record a run, again if the recording is invalid."""
+    planned = run.planned
     out = log_of(session, planned.name)
     lost = 0
     missing = (0,) * len(context.cell.axes)
-    for attempt in range(1, context.section.retries + 2):
+    for attempt in range(1, context.settings.retries + 2):
         _set_aside(out, context.journal)
-        context.journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
-        log = (recorded := _record(context, planned, plan, out)).log
+        context.journal.say(Level.INFO, "recording", attempt=attempt, seconds=run.plan.duration_s)
+        recorded = _record(context, run, out)
+        log = recorded.log
         for warning in recorded.warnings:
             context.journal.say(Level.WARNING, "warning of the recorder", text=warning)
         lost += log.lost_cycles
@@ -157,30 +191,32 @@ def _record_valid(context: JobContext, session: Session, planned: PlannedRun, pl
         context.journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
     raise RunInvalid(
         str(out),
-        found=f"{context.section.retries + 1} recordings, none of them valid (the last: {log.reason})",
+        found=f"{context.settings.retries + 1} recordings, none of them valid (the last: {log.reason})",
         expected="a valid one",
         remedy="see to the bus, the load of this computer and the encoders; the next job records this run again",
     )
 
 
-def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
+def _record(context: SessionContext, run: NextRun, out: Path, speed: float = 1.0) -> Recorded:
     """Make one recording; the interlock is checked before the drives are used, and again before they get power.
 
     Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
     """
+    planned = run.planned
     # `section_of` has checked that the cell has it.
     payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
     request = RecordingRequest(
         context.file,
         context.cell,
-        plan,
+        run.plan,
         out,
         payload=payload,
         operator=context.who,
-        granted_by=f"the policy of cell {context.cell.name} and its interlock, for {context.who}",
+        granted_by=context.operator.permit_motion(planned),
         run_id=str(uuid.uuid4()),
+        speed=speed,
         entered_kg=planned.mass_kg,
-        unguarded=context.cell.unguarded is Permission.ALLOWED,
+        unguarded=context.operator.unguarded,
     )
     return context.tools.record(
         request,
@@ -216,25 +252,25 @@ def _free_names(out: Path, kind: str) -> Iterator[Path]:
             yield path
 
 
-def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibration]:
+def fit_session(context: SessionContext, session: Session) -> Session:
     """Fit the logs, add missing effects, and write calibration and report, unless an earlier job did.
 
     Raises:
         DataError, IdentificationError: the recordings cannot be used; the session is over.
         OutputFailed: the file system refuses.
     """
-    done = calibration_of_session(session)
-    if done is not None:
-        return session, done
-    logs = [log_of(session, run.name) for run in context.section.runs if not run.holdout]
-    unseen = [log_of(session, run.name) for run in context.section.runs if run.holdout]
+    if calibration_of_session(session) is not None:
+        return session
+    runs = context.schedule.runs(session)
+    logs = [log_of(session, run.name) for run in runs if not run.holdout]
+    unseen = [log_of(session, run.name) for run in runs if run.holdout]
     context.journal.say(
         Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen]
     )
     try:
         fitted = context.tools.fit(logs, holdout=unseen)
         closed = context.tools.close_loop(
-            fitted, context.section.seed, lambda step: context.journal.say(Level.INFO, step)
+            fitted, context.settings.seed, lambda step: context.journal.say(Level.INFO, step)
         )
         check_holdout(closed)
         changed = context.tools.account(start_of(closed), closed.steps)
@@ -249,10 +285,11 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
     context.tools.save_report(closed, changed, calibration, report)
+    context.journal.say(Level.INFO, "certificate", page=str(report / PAGE))
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed, calibration.effects))
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence)
-    return session.update(fitted=fit), calibration
+    return session.update(fitted=fit)
 
 
 def calibration_of_session(session: Session) -> Calibration | None:

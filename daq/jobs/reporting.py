@@ -9,23 +9,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
-from daq.documents.session_state import Outcome, SessionState
+from daq.documents.session_state import GuidedState, Outcome, SessionState
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
-from daq.jobs.context import JobContext
+from daq.jobs.context import SessionContext
 from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
 from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.document import json_text
-from daq.report.job_schemas import JobReport, RefusedJob
+from daq.report.job_schemas import JobReport, RefusedJob, SessionReport
+from daq.report.residual_page import PAGE
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
+
+AnyReport = TypeVar("AnyReport", JobReport, SessionReport)
 
 SUMMARY_TEXT = "summary.txt"
 SUMMARY_JSON = "summary.json"
@@ -41,7 +45,7 @@ class Conclusion:
     remark: str  #: reason, in one sentence
 
 
-def report_success(context: JobContext, session: Session) -> Conclusion:
+def report_success(context: SessionContext, session: Session) -> Conclusion:
     """Report a session whose state has its outcome.
 
     Raises:
@@ -53,7 +57,7 @@ def report_success(context: JobContext, session: Session) -> Conclusion:
     return _report(context, session, outcome, code, remark, "")
 
 
-def report_failure(context: JobContext, folder: Path, error: BaseException) -> None:
+def report_failure(context: SessionContext, folder: Path, error: BaseException) -> None:
     """Report the error that ended a job; failures of the report itself are attached to the error as notes."""
     try:
         session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
@@ -66,7 +70,9 @@ def report_failure(context: JobContext, folder: Path, error: BaseException) -> N
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
 
-def audit_entry(context: JobContext, action: AuditAction, session: Session, details: dict[str, object]) -> AuditEntry:
+def audit_entry(
+    context: SessionContext, action: AuditAction, session: Session, details: dict[str, object]
+) -> AuditEntry:
     """Append an entry about the session to the audit.
 
     Raises:
@@ -83,7 +89,7 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
 
 
 def _report(
-    context: JobContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
+    context: SessionContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
 ) -> Conclusion:
     now = context.tools.now()
     state = session.state.with_(
@@ -110,13 +116,15 @@ def _report(
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        replace_file(session.folder / SUMMARY_JSON, json_text(conclusion_report(conclusion, context.file)).encode())
-    found = sessions.sessions(context.section.folder, context.cell.name)
-    if context.section.metrics is not None:
+        is_guided = isinstance(session.state, GuidedState)
+        report = session_report(conclusion, context.file) if is_guided else conclusion_report(conclusion, context.file)
+        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
+    found = sessions.sessions(context.settings.folder, context.cell.name)
+    if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
         try:
             write_metrics(
-                context.section.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
+                context.settings.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
             )
         except OutputFailed as error:
             # A monitor reports missing metrics itself; the calibration is done.
@@ -127,7 +135,7 @@ def _report(
     return conclusion
 
 
-def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
+def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
     # Where the calibrations in force are unknown, all sessions stay.
     try:
         history = read_history(context.ledger)
@@ -139,12 +147,21 @@ def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
         return
     newest = {event.target: event.digest for event in history.events}
     in_force = frozenset(digest for digest in newest.values() if digest is not None)
-    for folder in sessions.remove_old(found, context.section.keep_sessions, in_force):
+    for folder in sessions.remove_old(found, context.settings.keep_sessions, in_force):
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
 
 def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | RefusedJob:
     """Return how a job ended, for `recalibrate --json` and summary.json."""
+    return _as_report(JobReport, conclusion, cell_file)
+
+
+def session_report(conclusion: Conclusion, cell_file: Path) -> SessionReport | RefusedJob:
+    """Return how a guided session ended, for `calibrate --json` and summary.json."""
+    return _as_report(SessionReport, conclusion, cell_file)
+
+
+def _as_report(kind: type[AnyReport], conclusion: Conclusion, cell_file: Path) -> AnyReport | RefusedJob:
     refused = RefusedJob(
         outcome=conclusion.outcome,
         exit_code=conclusion.exit_code,
@@ -156,7 +173,7 @@ def conclusion_report(conclusion: Conclusion, cell_file: Path) -> JobReport | Re
         return refused
     # Not strictly: what is a tuple in a state is a list in its mapping.
     values = {**session.state.model_dump(), **dict(refused), "folder": str(session.folder)}
-    return JobReport.model_validate(values, strict=False)
+    return kind.model_validate(values, strict=False)
 
 
 def text(conclusion: Conclusion, cell_file: Path) -> str:
@@ -189,14 +206,46 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                     f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} "
                     f"{gain.unit} found{change}{drift}{': differs' if gain.differs else ''}"
                 )
+        if isinstance(state, GuidedState):
+            lines += _guided_lines(state)
         drifts = [gain.alarm for gain in state.watched if gain.alarm]
         if drifts:
             lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
-        lines += ["", f"Folder: {session.folder}"]
-        if (session.folder / REPORT / "report.html").exists():
-            lines.append(f"Report: {session.folder / REPORT / 'report.html'}")
-    lines += ["", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
+    lines += _closing(conclusion, cell_file)
     return "\n".join(lines) + "\n"
+
+
+def ending(conclusion: Conclusion, cell_file: Path) -> str:
+    """Write the end of a session for a person who has seen how it went."""
+    lines = ["", f"Outcome: {conclusion.outcome.value}"]
+    session = conclusion.session
+    if session is not None and isinstance(session.state, GuidedState):
+        lines += _guided_lines(session.state)
+    lines += _closing(conclusion, cell_file)
+    return "\n".join(lines) + "\n"
+
+
+def _closing(conclusion: Conclusion, cell_file: Path) -> list[str]:
+    """List the files of a session and the next steps."""
+    lines: list[str] = []
+    session = conclusion.session
+    if session is not None:
+        lines += ["", f"Folder: {session.folder}"]
+        page = session.folder / REPORT / PAGE
+        if page.exists():
+            lines.append(f"Report: {page}")
+    return [*lines, "", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
+
+
+def _guided_lines(state: GuidedState) -> list[str]:
+    """What a guided session adds: what was not reached, and whether new moves accept the gains."""
+    lines: list[str] = []
+    if state.missing:
+        lines += ["", f"Not reached: {state.missing}"]
+    if state.acceptance is not None:
+        verdict = "accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        lines += ["", f"New moves: {verdict}: {state.acceptance.remark}"]
+    return lines
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:

@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from daq.documents.session_state import SessionState
+from daq.documents.session_state import GuidedState, SessionState
 from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
@@ -24,6 +24,7 @@ STATE = "state.json"
 CALIBRATION = "calibration.yaml"
 REPORT = "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
+_ANY_STATE: TypeAdapter[SessionState | GuidedState] = TypeAdapter(SessionState | GuidedState)
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 _REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
@@ -44,9 +45,8 @@ class Session:
 
     @property
     def finished(self) -> bool:
-        """Whether no job resumes it; a job that was killed before it reported its end did not finish it."""
-        outcome = self.state.outcome
-        return outcome is not None and outcome.concluded and self.state.ended is not None
+        """Whether no job resumes it."""
+        return self.state.is_over
 
     @property
     def last_written(self) -> datetime:
@@ -113,8 +113,14 @@ class Basis:
     plans_sha256: str
 
 
-def begin(folder: Path, basis: Basis, now: datetime) -> Session:
+def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = SessionState) -> Session:
     """Begin a session: make its folder and write its state.
+
+    Args:
+        folder: of the sessions.
+        basis: of the session.
+        now: wall clock.
+        kind: of its state.
 
     Raises:
         OutputFailed: the file system refuses.
@@ -126,7 +132,7 @@ def begin(folder: Path, basis: Basis, now: datetime) -> Session:
         name = next(name for name in names if not (folder / name).exists())
         (folder / name).mkdir()
     at = now.isoformat(timespec="seconds")
-    return save(Session(folder / name, SessionState(session=name, began=at, attempt_began=at, **asdict(basis))))
+    return save(Session(folder / name, kind(session=name, began=at, attempt_began=at, **asdict(basis))))
 
 
 def save(session: Session) -> Session:
@@ -206,7 +212,7 @@ def _remove_remnants(newest: Path) -> None:
 
 def _read(path: Path) -> SessionState | None:
     with suppress(OSError, ValidationError, ValueError):
-        state = SessionState.model_validate_json(read_regular(path, LARGEST_STATE_BYTES))
+        state = _ANY_STATE.validate_json(read_regular(path, LARGEST_STATE_BYTES))
         # Ages are counted from these times, so each must be one, with a known zone.
         if all(time.utcoffset() is not None for time in _times(state)):
             return state

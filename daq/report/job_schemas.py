@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from daq.documents.calibration_file import EffectEntry
-from daq.documents.session_state import Outcome, SessionState
+from daq.documents.session_state import GuidedState, Outcome, SessionState
 from daq.report.document import Figure, Report
 
 
@@ -112,6 +112,13 @@ class JobReport(SessionState, ConcludedJob):
     """`recalibrate`: what is left to do, and the state of its session."""
 
     # Keys of the base that is named last come first.
+    outcome: Outcome
+    exit_code: int
+
+
+class SessionReport(GuidedState, ConcludedJob):
+    """`calibrate`: what is left to do, and the state of its session."""
+
     outcome: Outcome
     exit_code: int
 

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.files import open_regular, sha256
+from daq.files import open_regular, replace_file, sha256
 from daq.report.html import element, html_document, html_list, palette, visible_text
-from daq.workflow.experiment import PlannedMove, path_of
+from daq.workflow.experiment import PlannedMove, experiment_of, path_of
+from daq.workflow.plan import Plan
 from ident.arrays import FloatArray
 from ident.model.robot import poses
 from ident.planning.clearance import BASE, Checker
@@ -84,6 +85,22 @@ part comes; grey on the grid: its footprint. A square of the grid is {1000 * _GR
 <canvas id="speed"></canvas>
 <script id="data" type="application/json">{data}</script>"""
     return html_document(f"Plan for {cell.name}", f'{MARK}{sha256(plan)}">', _STYLE, body, script)
+
+
+def save_preview(cell: Cell, plan: Plan, file: Path, page: Path) -> None:
+    """Write the page of a plan.
+
+    Args:
+        cell: with the limits.
+        plan: as its file has it.
+        file: of the plan; the page has its digest.
+        page: to write; a file of that name is replaced whole.
+
+    Raises:
+        OSError: from the file system.
+    """
+    checker = experiment_of(cell).scene.checker
+    replace_file(page, preview_page(cell, plan.moves, checker, file.read_bytes()).encode())
 
 
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:

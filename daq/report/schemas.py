@@ -15,6 +15,7 @@ from daq.report.job_schemas import (
     JobReport,
     KeyReport,
     RefusedJob,
+    SessionReport,
     SignatureReport,
     SignersReport,
 )
@@ -41,6 +42,7 @@ REPORTS: dict[str, Any] = {
     "rollback": FileRollback | DriveRollback,
     "info": InfoReport,
     "history": HistoryReport,
+    "calibrate": SessionReport | RefusedJob,
     "recalibrate": DryRunReport | JobReport | RefusedJob,
     "sign": KeyReport | SignatureReport | SignersReport,
     "fleet": FleetReport,

@@ -6,19 +6,32 @@ once it is final.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from io import StringIO
+from itertools import chain
 from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
-from daq.documents.calibration_file import EffectEntry, as_document, save_calibration
+from daq.config.policy import HistoryPlace
+from daq.config.recalibration import PlannedRun
+from daq.documents.calibration_file import EffectEntry, as_document
+from daq.documents.session_state import SessionState
 from daq.environment import shipped_configurations
-from daq.errors import UsageError
+from daq.errors import CalibrationRefused, UsageError
 from daq.files import replace_file
+from daq.jobs.context import GainTarget, SessionContext, Tools
+from daq.jobs.journal import Form, Journal
+from daq.jobs.operator import GivenAnswers
+from daq.jobs.recording import FixedRuns
+from daq.jobs.session import REPORT, Session, save
+from daq.jobs.stages import TO_DECISION, run_stages
+from daq.ledger.audit import head_file
 from daq.report.comparison import compare
 from daq.report.fit import start_of
 from daq.report.job_schemas import DemoGain, DemoLog, DemoPlan, DemoReport, FleetEffect
@@ -28,17 +41,21 @@ from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
+from daq.workflow.safeguards import FreeBytes
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.bus import open_bus
+from drivers.canopen.network import SignalBlocker
 from drivers.canopen.node_scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import Account, account
 
 MARK = ".drivegain-demo"
-REPORT = "report"  #: Folder of the certificate
+AUDIT = "audit.jsonl"
+CONTROLLER_COPY = "controller.yaml"
+SUFFIX = ".mcap"  #: Of the logs
 RETRIES = 2  #: Of a run that came out invalid
 PLANS = ("a", "b", "c")
 RUNS = (
@@ -100,39 +117,187 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(cell_file)
     out = settings.out
-    logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
-    make_room(out, logs)
+    make_room(out, tuple(out / f"{name}.mcap" for name, _, _ in RUNS))
     reporter.step("scan the bus")
     with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
         nodes = network.scan()
         network.check_identities()
     reporter.step("plan exciting moves")
     plans = tuple(_plan(settings, cell, index, reporter) for index in range(len(PLANS)))
-    recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, reporter) for index in range(len(RUNS)))
-    reporter.step("identify all gains and parameters")
-    fitted = fit(logs[:-1], holdout=logs[-1:], keep_rows=True)
-    reporter.step("detect missing effects")
-    fitted = close_loop(fitted, settings.seed, lambda step: reporter.progress(0, 0, step))
-    calibration = calibration_of(fitted, now())
-    save_calibration(calibration, out / "calibration.yaml")
-    reporter.step("write the calibration to a copy of the controller file")
-    if cell.controller_path is None:
-        raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
-    target = out / "controller.yaml"
-    audit = out / "audit.jsonl"
-    replace_file(target, cell.controller_path.read_bytes())
-    proposal = propose(FileTarget.of(cell, target), Request(calibration, now()))
-    written = None if proposal.refusals else apply(proposal, now(), audit=audit, who="demo")
+    stages = DemoStages(settings, cell, now, reporter)
+    stages.run(cell_file)
     reporter.step("draw the pictures")
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+    fitted = stages.fitted
+    calibration = stages.calibration
+    proposal = stages.proposal
     draw_fit(fitted, calibration, truth, out)
     changed = account(start_of(fitted), fitted.steps)
-    (out / REPORT).mkdir(exist_ok=True)
     # After the write, so that the certificate says that the gains are written.
-    compared = compare(cell, Request(calibration, now()), file=target, audit=audit)
+    request = Request(calibration, now())
+    compared = compare(cell, request, file=out / CONTROLLER_COPY, audit=out / AUDIT)
     save_report(fitted, changed, calibration, out / REPORT, compared)
-    return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, written)
+    recorded = tuple(stages.recorded[name] for name, _, _ in RUNS)
+    return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, stages.written)
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Limits and places of a session, as a demonstration has them (`SessionSettings`)."""
+
+    folder: Path
+    seed: int
+    warm_up_min: float = 0.0
+    retries: int = RETRIES
+    min_free_mb: float = 0.0
+    keep_sessions: int = 1
+    metrics: Path | None = None
+
+
+class DemoStages:
+    """The stages of a job on the simulated cell, and what they make.
+
+    Attributes:
+        recorded: recordings by the names of their runs, the last one of each.
+        fitted: with the effects that were found.
+        calibration: as saved.
+        proposal: what the controller file would get.
+        written: what its copy got; None where a gate is closed.
+    """
+
+    fitted: Fit
+    calibration: Calibration
+    proposal: Proposal[FileEdit]
+
+    def __init__(self, settings: Settings, cell: Cell, now: Callable[[], datetime], reporter: ProgressReporter) -> None:
+        """Store the arguments, those of `demonstrate`."""
+        self._settings = settings
+        self._cell = cell
+        self._now = now
+        self._reporter = reporter
+        self._attempts: Counter[str] = Counter()
+        self.recorded: dict[str, Recorded] = {}
+        self.written: Written | None = None
+
+    def run(self, cell_file: Path) -> None:
+        """Take the stages.
+
+        Raises:
+            DaqError, DriverError, IdentificationError: whatever a job on a real cell could raise, but for a closed
+                gate: the proposal says which one it is.
+        """
+        cell = self._cell
+        out = self._settings.out
+        if cell.controller is None or cell.controller_path is None:
+            raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
+        controller_copy = out / CONTROLLER_COPY
+        replace_file(controller_copy, cell.controller_path.read_bytes())
+        masses_kg = {payload.name: payload.mass_kg for payload in cell.payloads}
+        context = SessionContext(
+            cell_file,
+            cell,
+            _Limits(out, self._settings.seed),
+            FixedRuns(_planned_runs(out, masses_kg)),
+            # A run powers on a cell that carries its payload: there is nothing to mount.
+            GivenAnswers("demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell"),
+            GainTarget(cell.controller, controller_copy, HistoryPlace(out / "history.sqlite", out / AUDIT)),
+            self._tools(controller_copy),
+            Journal(StringIO(), Form.TEXT, self._now),
+        )
+        at = self._now().isoformat(timespec="seconds")
+        state = SessionState(
+            session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at
+        )
+        with suppress(CalibrationRefused):
+            run_stages(TO_DECISION, context, save(Session(out, state)))
+
+    def _tools(self, controller_copy: Path) -> Tools:
+        """Return the tools of a job, which report their progress and keep what they make."""
+        reporter = self._reporter
+
+        def fit_runs(logs: Sequence[Path], *, holdout: Sequence[Path]) -> Fit:
+            reporter.step("identify all gains and parameters")
+            return fit(logs, holdout=holdout, keep_rows=True)
+
+        def close_reported(fitted: Fit, seed: int, _report: Callable[[str], None]) -> Fit:
+            reporter.step("detect missing effects")
+            self.fitted = close_loop(fitted, seed, lambda step: reporter.progress(0, 0, step))
+            return self.fitted
+
+        def calibrate(fitted: Fit, created: datetime) -> Calibration:
+            self.calibration = calibration_of(fitted, created)
+            return self.calibration
+
+        def propose_copy(_target: FileTarget, request: Request) -> Proposal[FileEdit]:
+            reporter.step("write the calibration to a copy of the controller file")
+            self.proposal = propose(FileTarget.of(self._cell, controller_copy), request)
+            return self.proposal
+
+        def apply_copy(proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str) -> Written | None:
+            self.written = apply(proposal, now, audit=audit, who=who)
+            return self.written
+
+        return Tools(
+            save_report=lambda *_: None,  # it is made with the pictures, when all is done
+            drives=lambda *_: None,  # they were scanned
+            record=self._record,
+            fit=fit_runs,
+            close_loop=close_reported,
+            calibration=calibrate,
+            propose=propose_copy,
+            apply=apply_copy,
+            now=self._now,
+        )
+
+    def _record(
+        self,
+        request: RecordingRequest,
+        *,
+        free: FreeBytes,
+        block_signals: SignalBlocker,
+        require_released: Callable[[], None],
+    ) -> Recorded:
+        """Record one run of a simulated cell that carries its payload; an invalid one is recorded again."""
+        settings = self._settings
+        reporter = self._reporter
+        name = request.out.stem
+        payload = None if request.payload is None else request.payload.name
+        self._attempts[name] += 1
+        if name not in self.recorded:
+            reporter.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+        else:
+            # A busy computer lets the simulated cell answer late, or twice in a period.
+            reason = self.recorded[name].log.reason
+            again = self._attempts[name] - 1
+            reporter.step(f"record {name} again ({again} of at most {RETRIES} times): {reason}")
+        spec = load_simulation(settings.simulation, payload)
+        # Another noise in every run, as another day would bring; the plant is the same.
+        index = [run for run, _, _ in RUNS].index(name)
+        spec = replace(spec, seed=spec.seed + 100 * settings.seed + index)
+        with _simulated(self._cell, spec):
+            self.recorded[name] = record(
+                replace(request, run_id=f"demo-{settings.seed}-{name}"),
+                free=free,
+                block_signals=block_signals,
+                progress=lambda done, total: reporter.progress(done, total, "moves"),
+                require_released=require_released,
+            )
+        return self.recorded[name]
+
+
+def _planned_runs(out: Path, masses_kg: dict[str, float]) -> tuple[PlannedRun, ...]:
+    """Return the runs of the demonstration."""
+    return tuple(
+        PlannedRun(
+            name=name,
+            payload=payload,
+            mass_kg=None if payload is None else masses_kg[payload],
+            plan_file=out / f"plan-{plan_name}.yaml",
+            holdout=name == RUNS[-1][0],
+        )
+        for name, payload, plan_name in RUNS
+    )
 
 
 def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
@@ -207,8 +372,11 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> None:
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-    for picture in out.glob("residual-*"):
-        picture.unlink()
+    for older in chain(out.glob("residual-*"), out.glob(f"*-aside-*{SUFFIX}")):
+        older.unlink()
+    # The audit and its head: the copy of the controller file is a new one.
+    for older in (out / AUDIT, head_file(out / AUDIT)):
+        older.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -235,42 +403,3 @@ def _plan(settings: Settings, cell: Cell, index: int, reporter: ProgressReporter
     )
     save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
     return made
-
-
-def _record_valid(
-    settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, reporter: ProgressReporter
-) -> Recorded:
-    """Record one run, again where it is invalid; the last attempt is kept as it is, for the fit."""
-    name, payload, plan_name = RUNS[index]
-    reporter.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
-    for attempt in range(1, RETRIES + 1):
-        recorded = _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, reporter)
-        if recorded.log.valid:
-            return recorded
-        # A busy computer lets the simulated cell answer late, or twice in a period.
-        reporter.step(f"record {name} again ({attempt} of at most {RETRIES} times): {recorded.log.reason}")
-        recorded.path.unlink()
-    return _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, reporter)
-
-
-def _record(
-    settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, reporter: ProgressReporter
-) -> Recorded:
-    name, payload, _ = RUNS[index]
-    spec = load_simulation(settings.simulation, payload)
-    declared = {candidate.name: candidate for candidate in cell.payloads}
-    mounted = None if payload is None else declared[payload]
-    request = RecordingRequest(
-        cell_file,
-        cell,
-        moves,
-        settings.out / f"{name}.mcap",
-        payload=None if mounted is None else mounted.payload,
-        operator="demo",
-        granted_by="the demonstration: a simulated cell",
-        run_id=f"demo-{settings.seed}-{name}",
-        entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
-    )
-    # Another noise in every run, as another day would bring; the plant is the same.
-    with _simulated(cell, replace(spec, seed=spec.seed + 100 * settings.seed + index)):
-        return record(request, progress=lambda done, total: reporter.progress(done, total, "moves"))

@@ -18,9 +18,9 @@ WRITERS = {
     # Steps of a write to a controller.
     "record_write": ("daq.ledger.ledger", {TARGET}),
     # Calibrations: those that are written, and those that a job proposes or a person enters.
-    "enter_calibration": ("daq.ledger.ledger", {TARGET, "daq/cli/history.py", "daq/jobs/job.py"}),
+    "enter_calibration": ("daq.ledger.ledger", {TARGET, "daq/cli/history.py", "daq/jobs/stages.py"}),
     # Steps of a job, which write to no controller.
-    "record_session": ("daq.ledger.ledger", {"daq/jobs/job.py", "daq/jobs/reporting.py"}),
+    "record_session": ("daq.ledger.ledger", {"daq/jobs/decision.py", "daq/jobs/reporting.py"}),
     "acknowledge": ("daq.ledger.ledger", {"daq/cli/history.py"}),
     "migrate": ("daq.ledger.ledger", {"daq/cli/history.py"}),
 }

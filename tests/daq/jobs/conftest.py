@@ -9,6 +9,7 @@ import pytest
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from tests.daq.jobs.made import Made, whole_job
+from tests.daq.jobs.made_session import MadeSession, whole_session
 from tests.daq.jobs.rig import Rig, make_plan
 
 
@@ -38,3 +39,17 @@ def whole_job_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Made]
 def made(whole_job: tuple[Rig, Made]) -> Made:
     """Its logs and its fit."""
     return whole_job[1]
+
+
+@pytest.fixture(scope="session", name="whole_session")
+def whole_session_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, MadeSession]:
+    """A real guided session from the first frame to the acceptance, and what it made."""
+    folder = tmp_path_factory.mktemp("guided") / "cell"
+    folder.mkdir()
+    return whole_session(folder)
+
+
+@pytest.fixture(scope="session")
+def made_session(whole_session: tuple[Rig, MadeSession]) -> MadeSession:
+    """Its logs and its fit."""
+    return whole_session[1]

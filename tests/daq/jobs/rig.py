@@ -80,12 +80,14 @@ class Rig:
         clock: of the job.
         tools: that the job gets.
         said: the journal's lines.
+        kind: of its sessions, which names their folder: recalibration, or sessions of `calibrate`.
     """
 
     folder: Path
     clock: TestClock
     tools: Tools
     said: io.StringIO = field(default_factory=io.StringIO)
+    kind: str = "recalibration"
 
     @property
     def cells(self) -> Path:
@@ -110,7 +112,7 @@ class Rig:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        return sessions(self.cells / "demo.recalibration", "demo")
+        return sessions(self.cells / f"demo.{self.kind}", "demo")
 
     @property
     def session(self) -> Session:

@@ -17,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from daq.documents.session_state import Outcome
 from daq.errors import OutputFailed
-from daq.jobs.context import JobContext
+from daq.jobs.context import SessionContext
 from daq.jobs.journal import Form, Journal, Level, form_of
 from daq.jobs.reporting import Conclusion, report_failure, write_metrics
 from drivers.errors import DriveFault
@@ -53,7 +53,7 @@ def test_a_report_that_fails_does_not_hide_the_error_that_ended_the_job(
 
     monkeypatch.setattr("daq.jobs.session.sessions", unreadable)
     error = DriveFault(3, "fault")
-    context = cast("JobContext", None)  # the report fails before it is used
+    context = cast("SessionContext", None)  # the report fails before it is used
     report_failure(context, tmp_path, error)
     assert error.__notes__ == ["kept: the end of the session could not be recorded: no session"]
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from daq.config.cell_file import load_cell
+from daq.errors import DataError, RunInvalid
+from daq.jobs.stages import Record
 from daq.log.metadata import RunStatistics
 from daq.simulation import demo
-from daq.simulation.demo import RETRIES, ProgressReporter, Settings
-from daq.workflow.plan import Plan
-from daq.workflow.record import Recorded
+from daq.simulation.demo import RETRIES, DemoStages, ProgressReporter, Settings
+from daq.simulation.simulation_file import shipped_simulation
+from daq.workflow.plan import plan, save_plan
+from daq.workflow.record import Recorded, RecordingRequest
 from drivers.stream.answers import StreamStatistics
+from tests.daq.jobs.rig import BEGAN
 
 NOTHING_LOST = StreamStatistics(*(0 for _ in StreamStatistics.__slots__))
 
@@ -21,32 +27,35 @@ NOTHING_LOST = StreamStatistics(*(0 for _ in StreamStatistics.__slots__))
 def test_an_invalid_run_is_made_again_and_said_so(
     spoilt: int, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    attempts = 0
+    made: list[RecordingRequest] = []
     steps: list[str] = []
 
-    def record(*_: object) -> Recorded:
-        nonlocal attempts
-        attempts += 1
-        path = tmp_path / "bare-1.mcap"
-        path.touch(exist_ok=False)
-        log = RunStatistics(10, 0, (0,), valid=attempts > spoilt, reason="3 late answers")
-        return Recorded(path, log, NOTHING_LOST)
+    def record(request: RecordingRequest, **_: object) -> Recorded:
+        made.append(request)
+        request.out.touch(exist_ok=False)
+        log = RunStatistics(10, 0, (0,) * 6, valid=len(made) > spoilt, reason="3 late answers")
+        return Recorded(request.out, log, NOTHING_LOST)
 
-    monkeypatch.setattr("daq.simulation.demo._record", record)
+    monkeypatch.setattr(demo, "record", record)
+    monkeypatch.setattr(demo, "_simulated", lambda _cell, _spec: nullcontext())
+    monkeypatch.setattr(demo, "TO_DECISION", (Record(),))
     cell_file = checkout / "configs/cells/demo.yaml"
-    plans = (Plan.__new__(Plan),) * 3
-    done = demo._record_valid(
-        Settings(tmp_path, tmp_path / "not-read.yaml", 1, 10.0),
-        cell_file,
-        load_cell(cell_file),
-        plans,
-        0,
-        ProgressReporter(steps.append, lambda *_: None),
-    )
-    assert attempts == min(spoilt, RETRIES) + 1
-    assert done.log.valid is (spoilt <= RETRIES)
+    cell = load_cell(cell_file)
+    moves = plan(cell, seed=1, duration_s=6.0, exchanges=0, largest_condition=1e9, largest_std_percent=1e9)
+    for name in demo.PLANS:
+        save_plan(replace(moves, moves=moves.moves[:1]), tmp_path / f"plan-{name}.yaml")
+    settings = Settings(tmp_path, shipped_simulation(), 1, 10.0)
+    stages = DemoStages(settings, cell, lambda: BEGAN, ProgressReporter(steps.append, lambda *_: None))
+    if spoilt > RETRIES:
+        with pytest.raises(RunInvalid, match="3 late answers"):
+            stages.run(cell_file)
+        assert issubclass(RunInvalid, DataError)  # as a fit of that run would end
+    else:
+        stages.run(cell_file)
+        assert [request.out.stem for request in made[spoilt:]] == [name for name, _, _ in demo.RUNS]
+        assert all(stages.recorded[name].log.valid for name, _, _ in demo.RUNS)
     assert [step for step in steps if "again" in step] == [
         f"record bare-1 again ({attempt} of at most {RETRIES} times): 3 late answers"
         for attempt in range(1, min(spoilt, RETRIES) + 1)
     ]
-    assert done.path.exists()
+    assert made[0].run_id == "demo-1-bare-1"

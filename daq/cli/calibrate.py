@@ -1,0 +1,279 @@
+"""`drivegain calibrate`: one session with a person, from a wired cell to an accepted calibration."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
+from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
+from daq.environment import login
+from daq.errors import ExitCode, JobHeld, UsageError
+from daq.report.text import printable
+from drivers.errors import MotionRefused, stop_notes
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell, WeighedPayload
+    from daq.config.recalibration import PlannedRun
+    from daq.jobs.calibrate import CheckLine
+    from daq.jobs.context import Tools
+    from daq.log.feed import Feed
+    from daq.workflow.fit import Fit
+    from daq.workflow.record import Recorded, RecordingRequest
+    from daq.writeback.file_target import FileEdit
+    from daq.writeback.target import Proposal
+    from ident.calibration import Calibration
+    from ident.discovery.before_after import Account
+
+YES = "yes"  #: What the operator types to write
+KEEP = "keep"  #: What the operator types where a block shows a mistake and is right all the same
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateOptions:
+    """A guided session, as the command line asks for it."""
+
+    cell: CellArgument
+    enable_motion: Annotated[
+        bool, typer.Option("--enable-motion", help="Allow motion; each block still asks before power comes on.")
+    ] = False
+    check: Annotated[bool, typer.Option("--check", help="Only check what a session needs; nothing moves.")] = False
+    payload: Annotated[str | None, typer.Option(help="Body for the loaded blocks, if the cell has several.")] = None
+    target: Annotated[
+        float | None,
+        typer.Option(
+            help="σ of every gain at which the recording ends [%]; target_sigma_percent of the cell file by default.",
+            min=0.05,
+            max=10.0,
+        ),
+    ] = None
+    block: Annotated[float, typer.Option(help="Duration of a block [s].", min=5.0, max=600.0)] = 20.0
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="First make the moves of three blocks at 25 % of their speed.")
+    ] = False
+    time_limit: Annotated[float, typer.Option(help="Motion after which the recording ends [min].", min=1.0)] = 30.0
+    sessions: Annotated[
+        Path | None, output_option("--sessions", "Folder of the sessions, by default beside the cell file.")
+    ] = None
+    by: Annotated[str | None, typer.Option("--by", help="Operator, for logs and audit; you, by default.")] = None
+    yes_move: Annotated[
+        bool, typer.Option("--yes-move", help="Do not ask before each block: on simulated cells alone.")
+    ] = False
+    json: JsonOption = False
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """An operator at the terminal, who mounts, weighs, permits each motion and types `yes` to write."""
+
+    cell: Cell
+    who: str
+    may_move: bool  #: --enable-motion
+    asks_before_motion: bool  #: not with --yes-move
+
+    @property
+    def unguarded(self) -> bool:
+        """No: a person at the terminal uses `record --unguarded` for such drives."""
+        return False
+
+    def mount(self, run: PlannedRun) -> None:
+        """Ask for what the next block carries."""
+        from daq.jobs.position import on_flange
+
+        say("")
+        say(f"── {run.name}: {on_flange(run)} ──", bold=True)
+        if self.asks_before_motion:
+            todo = "Take off what is there" if run.payload is None else "Mount it if it is not mounted"
+            ask(f"{todo}, leave the cell, then press Enter")
+
+    def weigh(self, payload: str) -> float:
+        """Ask for the mass from the scale, twice, until both are the same and that of the cell file."""
+        declared = next(one for one in self.cell.payloads if one.name == payload)
+        while True:
+            first_kg = _number(ask(f"Mass of {payload} read from the scale [kg]"))
+            second_kg = _number(ask("The same once more"))
+            if first_kg is None or first_kg != second_kg:
+                say("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
+                continue
+            refusal = _refused_mass(declared, first_kg)
+            if not refusal:
+                return first_kg
+            say(refusal)
+
+    def permit_motion(self, run: PlannedRun) -> str:
+        """Ask once more before power comes on."""
+        if not self.may_move:
+            raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
+        if self.asks_before_motion:
+            ask(f"The robot moves now. Press Enter to start {run.name}, Ctrl-C to stop here")
+        return self.who
+
+    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+        """Ask whether a block with a mistake is recorded again; `keep` keeps it."""
+        return ask(f"Press Enter to record it again, or type {KEEP} to keep {run.name} as it is") != KEEP
+
+    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+        """Show the change, and ask for `yes`."""
+        from daq.report.proposal import show_proposal
+
+        show_proposal(proposal, output_console())
+        if touched:
+            say("! The controller's file was written or rolled back since the session began.")
+        return ask(f"Type {YES} to write these gains to {proposal.edit.subject}, anything else to leave them") == YES
+
+
+def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
+    """Return why a mass from the scale is not taken; empty where it is."""
+    from daq.workflow.safeguards import agree
+
+    tolerance_kg = declared.mass_tolerance_kg
+    if agree(mass_kg, declared.mass_kg, tolerance_kg):
+        return ""
+    expected = f"the cell file has {declared.mass_kg:g} kg within {tolerance_kg:g} kg"
+    if agree(mass_kg / 1000.0, declared.mass_kg, tolerance_kg):
+        return f"Found {mass_kg:g}, which is the mass in grams; {expected}. Type it in kg."
+    return (
+        f"Found {mass_kg:g} kg; {expected}. Weigh it again. If the cell file is wrong, press Ctrl-C and correct it: "
+        "all gains are in proportion to this mass."
+    )
+
+
+def say(text: str, *, bold: bool = False) -> None:
+    """Print a line for the operator."""
+    typer.secho(printable(text), err=True, bold=bold)
+
+
+def ask(question: str) -> str:
+    """Ask the operator; return the answer without spaces.
+
+    Raises:
+        JobHeld: nobody answers.
+    """
+    typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
+    answer = sys.stdin.readline()
+    if not answer:
+        typer.echo("", err=True)
+        raise JobHeld(
+            question,
+            found="no answer: the input has ended",
+            expected="an operator at the terminal",
+            remedy="start the same command in a terminal; the session goes on where it is",
+        )
+    return answer.strip()
+
+
+def open_page(page: Path) -> None:
+    """Show a page in the browser, where a person is at a terminal with a display."""
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if has_display and sys.stdin is not None and sys.stdin.isatty():
+        webbrowser.open(page.resolve().as_uri())
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None
+
+
+def _check_yes_move(cell: Cell, given: bool) -> None:
+    """Refuse --yes-move where a machine may be on the bus."""
+    real = [bus.interface for bus in cell.buses if not bus.kind.is_simulated]
+    if given and real:
+        raise UsageError(
+            "--yes-move",
+            found=f"a bus on which a robot may be ({', '.join(real)})",
+            expected="a simulated cell",
+            remedy="leave it out: each block asks before power comes on",
+        )
+
+
+def _show_check(lines: Sequence[CheckLine]) -> None:
+    """Print the table of what a session needs; end with an exit code where something is missing."""
+    for line in lines:
+        mark = "✓" if line.passed else "✗"
+        typer.echo(printable(f"{mark} {line.name}: {line.text}"))
+    if not all(line.passed for line in lines):
+        raise typer.Exit(ExitCode.CONFIGURATION)
+
+
+def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
+    """Return the tools of a session, which show a person what they do."""
+    from daq.jobs.certificate import save_certificate
+    from daq.jobs.context import Tools
+    from daq.report.residual_page import PAGE
+    from daq.workflow.record import record
+
+    def save_report(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
+        certificate = save_certificate(cell_file, cell, fitted, changed, calibration, folder)
+        say("")
+        say(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
+        open_page(folder / PAGE)
+
+    def record_with_bar(request: RecordingRequest, **further: Any) -> Recorded:
+        # A bar of its own: between two blocks the operator types, and a bar would take the line.
+        with progress_bar(f"recording {request.out.stem}") as report_progress:
+            return record(
+                request, feed=feed, progress=lambda done, total: report_progress(done, total, "moves"), **further
+            )
+
+    return Tools(save_report=save_report, record=record_with_bar)
+
+
+@taking(CalibrateOptions)
+def calibrate_verb(options: CalibrateOptions) -> None:
+    """Calibrate a cell in one session: check, record until every gain is precise, identify, write, accept.
+
+    Nothing moves without --enable-motion, and each block asks before power comes on. Ctrl-C stops the axes; the same
+    command goes on where the session is. Nothing is written to the controller before you have typed `yes`.
+    """
+    from daq.jobs.calibrate import calibrate, check_readiness, context_of, payload_for_blocks
+    from daq.jobs.guided import GuidedSettings
+    from daq.jobs.journal import Form
+    from daq.jobs.position import sessions_folder
+    from daq.jobs.reporting import ending, session_report
+    from daq.jobs.story import Story
+    from daq.log.feed import Feed
+
+    declared = read_cell(options.cell)
+    _check_yes_move(declared, options.yes_move)
+    payload = payload_for_blocks(declared, options.payload)
+    settings = GuidedSettings(
+        options.sessions or sessions_folder(options.cell),
+        payload.name,
+        target_percent=options.target or declared.target_sigma_percent,
+        block_s=options.block,
+        time_limit_min=options.time_limit,
+        rehearse=options.rehearse,
+    )
+    person = Person(declared, options.by or login(), options.enable_motion, not options.yes_move)
+    journal = Story(sys.stderr, Form.TEXT, lambda: datetime.now(UTC))
+
+    try:
+        with interruptible() as block_signals, Feed(options.cell) as feed:
+            tools = _tools(options.cell, declared, feed)
+            if options.check:
+                context = context_of(options.cell, declared, settings, person, tools, journal)
+                _show_check(check_readiness(context, options.payload, options.block))
+                return
+            if not options.enable_motion:
+                raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
+            ended = calibrate(options.cell, declared, settings, person, tools, journal, block_signals=block_signals)
+    except KeyboardInterrupt as interrupt:
+        axes = "; ".join(stop_notes(interrupt)) or "axes stopped"
+        say_last(f"interrupted: {axes}; the same command goes on where the session is")
+        raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+    if options.json:
+        print_json(session_report(ended, options.cell))
+    else:
+        typer.echo(printable(ending(ended, options.cell)), nl=False)
+    if ended.exit_code:
+        raise typer.Exit(ended.exit_code)

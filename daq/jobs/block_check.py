@@ -1,0 +1,211 @@
+"""Look at a block right after its recording: a mistake that it shows costs one block then, and not the session.
+
+The body on the flange is weighed with the gains of the data sheet (`ident.weighing`), beside the blocks before. These
+gains may be off by a quarter; a body that was forgotten is off by all of its mass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell, model_of
+from daq.documents.session_state import Block
+from daq.errors import DataError
+from daq.log.conversion import load_run
+from ident.calibration import Calibration, Gain
+from ident.errors import IdentificationError
+from ident.estimators.estimate import RelativeError
+from ident.weighing import weigh
+
+LEAST_SHARE = 0.25  #: Of the payload's mass; a smaller difference is that of the gains of the data sheet
+LEAST_SIGMAS = 5.0  #: Of the difference
+COARSE_SHARE = 0.5  #: The same of the payload's mass: a coarser weighing tells nothing
+MOMENT = slice(6, 9)  #: m x, m y and m z among the ten parameters of a body
+LARGEST_SHIFT_M = 0.02  #: Of the centre of mass between two blocks; a turned body moves it by more
+SAME_BODY = (0.5, 2.0)  #: Weighed over declared mass: outside, it is another body, or a gain is far off
+
+
+@dataclass(frozen=True, slots=True)
+class BlockFacts:
+    """What the log of a block shows by itself, and beside earlier blocks."""
+
+    unreadable: str = ""  #: why no fit can use it; empty where one can
+    saturated_percent: tuple[float, ...] = ()  #: share of samples with an active current limit, by axis
+    added_kg: float | None = None  #: mass on the flange beyond that in the earlier blocks; None where it does not show
+    added_std_kg: float = 0.0  #: its σ, the gains taken as exact
+    added_moment_kg_m: float = 0.0  #: size of the first moment of mass that comes with it; 0 where it does not show
+    added_moment_std_kg_m: float = 0.0  #: its σ likewise
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """A mistake in a block."""
+
+    blocks: tuple[str, ...]  #: to record again, the last ones of the session
+    text: str  #: what was found and what to do, in a sentence or two
+
+
+def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
+    """Read the log of a block, and weigh what it carries beyond earlier blocks.
+
+    Args:
+        cell: of the session.
+        log: of the block.
+        earlier: logs that all carry the same; without any, nothing is weighed.
+    """
+    try:
+        run, _ = load_run(log, cell)
+        others = [load_run(one, cell)[0] for one in earlier]
+    except DataError as error:
+        return BlockFacts(unreadable=f"{error.found}: {error.remedy}")
+    saturated = () if run.recording is None else run.recording.saturated_percent
+    if not others:
+        return BlockFacts(saturated_percent=saturated)
+    try:
+        body = weigh(_of_data_sheet(cell), model_of(cell), (run,), cell.conditioning, bare=others)
+    except IdentificationError:
+        return BlockFacts(saturated_percent=saturated)
+    if not np.isfinite(body.mass_kg):
+        return BlockFacts(saturated_percent=saturated)
+    moment_kg_m = np.nan_to_num(body.values[MOMENT])
+    moment_std_kg_m = np.nan_to_num(body.std[MOMENT])
+    return BlockFacts(
+        saturated_percent=saturated,
+        added_kg=body.mass_kg,
+        added_std_kg=body.mass_std_kg,
+        added_moment_kg_m=float(np.linalg.norm(moment_kg_m)),
+        added_moment_std_kg_m=float(np.linalg.norm(moment_std_kg_m)),
+    )
+
+
+def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
+    """Return the earlier blocks that the last one is weighed beside: those with the same body, else the bare ones."""
+    *earlier, last = blocks
+    same = tuple(block for block in earlier if block.payload == last.payload)
+    return same or tuple(earlier)
+
+
+def mistake_in(cell: Cell, blocks: Sequence[Block], facts: BlockFacts) -> Mistake | None:
+    """Judge the last block.
+
+    Args:
+        cell: of the session.
+        blocks: of the session, in the order of their recording.
+        facts: of the last block, beside `compared_with` of these blocks.
+    """
+    last = blocks[-1]
+    if facts.unreadable:
+        return Mistake((last.name,), f"No fit can use this block: {facts.unreadable}.")
+    limited = _limited(cell, facts)
+    if limited:
+        return Mistake((last.name,), limited)
+    bodies = {block.payload: block.mass_kg for block in blocks if block.payload is not None and block.mass_kg}
+    if facts.added_kg is None or not bodies:
+        return None
+    ((payload, mass_kg),) = bodies.items()
+    noise_kg = LEAST_SIGMAS * facts.added_std_kg
+    if noise_kg > COARSE_SHARE * mass_kg:
+        return None
+    least_kg = max(LEAST_SHARE * mass_kg, noise_kg)
+    has_same = compared_with(blocks)[-1].payload == last.payload
+    if has_same:
+        return _beside_same(last, payload, facts.added_kg, least_kg) or _turned(last, mass_kg, facts)
+    return _beside_bare(blocks, payload, mass_kg, facts.added_kg, least_kg)
+
+
+def _limited(cell: Cell, facts: BlockFacts) -> str:
+    """Name the axis that was at its current limit for longer than a write takes; empty where none was."""
+    most_percent = cell.apply.max_saturated_percent
+    for axis, percent in zip(cell.axis_names, facts.saturated_percent, strict=False):
+        if percent > most_percent:
+            return (
+                f"{axis} was at its current limit for {percent:.1f} % of this block, and a write takes at most "
+                f"{most_percent:g} %. Press Ctrl-C, lower the acceleration limit of {axis} in the cell file, and start "
+                "again."
+            )
+    return ""
+
+
+def _beside_same(last: Block, payload: str, added_kg: float, least_kg: float) -> Mistake | None:
+    """Judge a block beside earlier ones that should carry the same."""
+    if abs(added_kg) <= least_kg:
+        return None
+    name = payload.upper()
+    if last.payload is None:
+        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {name} off."
+        return Mistake((last.name,), text)
+    change = f"{abs(added_kg):.2g} kg {'more' if added_kg > 0.0 else 'less'}"
+    text = f"The flange carried about {change} than in the loaded blocks before: mount {name}, as it was then."
+    return Mistake((last.name,), text)
+
+
+def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
+    """Judge whether the right body is mounted as it was in the blocks before."""
+    if last.payload is None:
+        return None
+    shift_m = facts.added_moment_kg_m / mass_kg
+    noise_m = LEAST_SIGMAS * facts.added_moment_std_kg_m / mass_kg
+    if shift_m <= max(LARGEST_SHIFT_M, noise_m):
+        return None
+    text = (
+        f"The centre of mass of {last.payload.upper()} was about {1000.0 * shift_m:.0f} mm away from where it was in "
+        "the loaded blocks before: mount it as it was then, not turned."
+    )
+    return Mistake((last.name,), text)
+
+
+def _beside_bare(
+    blocks: Sequence[Block], payload: str, mass_kg: float, added_kg: float, least_kg: float
+) -> Mistake | None:
+    """Judge the first loaded block beside the bare ones."""
+    last = blocks[-1]
+    name = payload.upper()
+    everything = tuple(block.name for block in blocks)
+    if abs(added_kg) <= least_kg:
+        text = (
+            f"The flange carried the same in {' and '.join(everything)}: {name} was missing now, or there before. "
+            "Both are recorded again, the first one without anything on the flange."
+        )
+        return Mistake(everything, text)
+    if added_kg < 0.0:
+        text = (
+            f"The flange carried about {-added_kg:.2g} kg more without load than with {name}: the two were exchanged. "
+            "Both are recorded again, the first one without anything on the flange."
+        )
+        return Mistake(everything, text)
+    lower, upper = SAME_BODY
+    if not lower <= added_kg / mass_kg <= upper:
+        text = (
+            f"The flange carried about {added_kg:.2g} kg by the gains of the data sheet, and {name} has "
+            f"{mass_kg:g} kg: another body was mounted, or these gains are far off."
+        )
+        return Mistake((last.name,), text)
+    return None
+
+
+def _of_data_sheet(cell: Cell) -> Calibration:
+    """Return a calibration that has the gains of the data sheet, and nothing else."""
+    gains = tuple(
+        Gain(axis=axis.name, value=axis.nameplate_gain, std=0.0, unit=axis.gain_unit, nameplate=axis.nameplate_gain)
+        for axis in cell.axes
+    )
+    return Calibration(
+        cell=cell.name,
+        method="none",
+        gains=gains,
+        parameters=(),
+        effects=(),
+        relative_error_percent=RelativeError((0.0,) * len(gains), 0.0),
+        holdout_error_percent=None,
+        condition=1.0,
+        rows=0,
+        filter={},
+        sources=(),
+        configuration_sha256=cell.digest,
+        created="",
+        software="",
+    )

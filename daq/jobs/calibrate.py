@@ -1,0 +1,185 @@
+"""A guided session: from a wired cell to an accepted calibration, with a person who mounts, weighs and approves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from io import StringIO
+from pathlib import Path
+
+from daq.config.cell import Cell, WeighedPayload
+from daq.documents.session_state import GuidedState
+from daq.errors import ConfigurationInconsistent, DaqError
+from daq.jobs import session as sessions
+from daq.jobs.acceptance import Accept
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, target_of
+from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise
+from daq.jobs.journal import Journal, Level
+from daq.jobs.operator import Operator
+from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
+from daq.jobs.session import Basis, Session
+from daq.jobs.stages import TO_DECISION, Stage, run_stages
+from daq.ledger.audit import AuditAction
+from daq.workflow.bus_lock import bus_lock
+from drivers.canopen.network import SignalBlocker
+from drivers.errors import DriverError
+
+RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
+
+
+def calibrate(
+    cell_file: Path,
+    cell: Cell,
+    settings: GuidedSettings,
+    operator: Operator,
+    tools: Tools,
+    journal: Journal,
+    *,
+    block_signals: SignalBlocker = nullcontext,
+    lock_folder: Path | None = None,
+) -> Conclusion:
+    """Calibrate a cell with an operator, or go on with the session that was ended before.
+
+    Raises:
+        JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next line.
+        DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, and audit
+            and state report it. The same call goes on from there.
+    """
+    context = context_of(cell_file, cell, settings, operator, tools, journal)
+    with bus_lock(cell, lock_folder):
+        session = _resumed_or_new(context)
+        journal = replace(journal, session=session.state.session)
+        context = replace(context, journal=journal, began_s=tools.monotonic_s(), block_signals=block_signals)
+        try:
+            audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
+            session = run_stages(stages_of(settings), context, session)
+        except BaseException as error:
+            report_failure(context, session.folder, error)
+            raise
+        return report_success(context, session)
+
+
+def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
+    """Return the stages of a guided session: those of the job, then the acceptance."""
+    rehearsal = (Rehearse(UntilPrecise(settings)),) if settings.rehearse else ()
+    return (*rehearsal, *TO_DECISION, Accept())
+
+
+def context_of(
+    cell_file: Path, cell: Cell, settings: GuidedSettings, operator: Operator, tools: Tools, journal: Journal
+) -> SessionContext:
+    """Return what the stages of a guided session share."""
+    return SessionContext(cell_file, cell, settings, UntilPrecise(settings), operator, target_of(cell), tools, journal)
+
+
+def session_basis(cell: Cell) -> Basis:
+    """Return what a session must share with the present cell to be resumed; its plans are its own."""
+    return Basis(cell.name, cell.digest, "")
+
+
+def _resumed_or_new(context: SessionContext) -> Session:
+    """Take up the newest session if it is unfinished, of the same cell file and recent; else begin one."""
+    now = context.tools.now()
+    folder = context.settings.folder
+    found = sessions.sessions(folder, context.cell.name)
+    require_clock(found, now)
+    session = sessions.resumable_session(found, session_basis(context.cell), now, RESUME_WITHIN_H)
+    if session is None:
+        _say_why_new(context, found, now)
+        session = sessions.begin(folder, session_basis(context.cell), now, GuidedState)
+        context.journal.say(Level.NOTICE, "session begun", folder=str(session.folder))
+        return session
+    attempt = session.state.attempt + 1
+    blocks = [run.name for run in session.state.runs]
+    context.journal.say(Level.NOTICE, "session taken up", attempt=attempt, recorded=", ".join(blocks) or "nothing")
+    return session.update(
+        attempt=attempt,
+        attempt_began=now.isoformat(timespec="seconds"),
+        outcome=None,
+        exit_code=None,
+        problem="",
+        ended=None,
+    )
+
+
+def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datetime) -> None:
+    """Say why an unfinished session is not taken up."""
+    if not found or found[-1].finished:
+        return
+    last = found[-1]
+    reason = "the cell file has changed since"
+    if now - last.began > timedelta(hours=RESUME_WITHIN_H):
+        reason = f"it is older than {RESUME_WITHIN_H:g} h"
+    context.journal.say(Level.WARNING, "an unfinished session is not taken up", folder=str(last.folder), reason=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckLine:
+    """One line of the table before a session."""
+
+    name: str  #: what was checked
+    passed: bool
+    text: str  #: what was found; what to do where it did not pass
+
+
+def check_readiness(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
+    """Check what a session needs, and predict what it can know; nothing moves, and nothing is written."""
+    return (
+        _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
+        _checked("payload", lambda: _payload_text(context.cell, payload)),
+        _checked("disk, interlock, drives", lambda: _ready_text(context)),
+        _checked("gains that a first session can show", lambda: _predicted_text(context, block_s)),
+    )
+
+
+def _checked(name: str, ask: Callable[[], str]) -> CheckLine:
+    """Ask, and turn an error into a line."""
+    try:
+        return CheckLine(name, True, ask())
+    except (DaqError, DriverError) as error:
+        return CheckLine(name, False, str(error))
+
+
+def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:
+    """Return the body for the loaded blocks: the named one, or the only one of the cell.
+
+    Raises:
+        ConfigurationInconsistent: the cell has no such body, or several and none was named.
+    """
+    names = [payload.name for payload in cell.payloads]
+    if name is None and len(names) == 1:
+        name = names[0]
+    for payload in cell.payloads:
+        if payload.name == name:
+            return payload
+    raise ConfigurationInconsistent(
+        f"payload of cell {cell.name!r}",
+        found="none named" if name is None else repr(name),
+        expected=f"one of {', '.join(names)}"
+        if names
+        else "at least one in `payloads`: its mass is the scale of all gains",
+        remedy="name it with its mass, as in docs/how-to/plan-moves.md" if not names else "name one of them",
+    )
+
+
+def _payload_text(cell: Cell, name: str | None) -> str:
+    payload = payload_for_blocks(cell, name)
+    return f"{payload.name}, {payload.mass_kg:g} kg within {payload.mass_tolerance_kg:g} kg"
+
+
+def _ready_text(context: SessionContext) -> str:
+    folder = context.settings.folder
+    there = next(path for path in (folder, *folder.parents) if path.is_dir())
+    tools = replace(context.tools, free=lambda _: context.tools.free(there))
+    quiet = replace(context.journal, stream=StringIO())
+    before_motion(replace(context, tools=tools, journal=quiet), take_over=False)
+    return "free space, history readable, robot released, drives as declared and without power"
+
+
+def _predicted_text(context: SessionContext, block_s: float) -> str:
+    plan = context.tools.plan(context.cell, seed=context.settings.seed, duration_s=block_s)
+    predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
+    listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
+    return f"σ predicted for one bare and one loaded block: {listed}"

@@ -1,0 +1,176 @@
+"""Compare a calibration with the gains in the controller, and write it where the operator approves."""
+
+from __future__ import annotations
+
+import math
+from datetime import datetime
+
+from daq.documents.calibration_file import read_calibration_bytes
+from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite
+from daq.errors import writing
+from daq.files import replace_file, sha256, sha256_of
+from daq.jobs.context import SessionContext
+from daq.jobs.journal import Level
+from daq.jobs.session import CALIBRATION, Session
+from daq.ledger.audit import AuditAction
+from daq.ledger.audit import read as read_audit
+from daq.ledger.fold import History
+from daq.ledger.ledger import record_session
+from daq.report.document import json_text
+from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
+from daq.writeback.file_access import resolve_links
+from daq.writeback.file_target import FileEdit, FileTarget
+from daq.writeback.gates.gate import Gate
+from daq.writeback.judgement import Spread, judge, known_of
+from daq.writeback.request import GainChange, Request
+from daq.writeback.target import Proposal, Written
+from ident.calibration import Calibration
+
+CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
+PROPOSAL = "proposal.json"
+DIFF = "proposal.diff"
+
+
+def decide_outcome(context: SessionContext, session: Session, calibration: Calibration, history: History) -> Session:
+    """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
+
+    Raises:
+        CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
+        AuditUnusable, OutputFailed: see `daq.writeback.target`.
+    """
+    path = session.folder / CALIBRATION
+    now = context.tools.now()
+    digest = sha256_of(path) or ""
+    before = session.state.target
+    if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
+        # The job was killed right after its write: the history has it by now, and it is never repeated.
+        words = "the controller's file has these gains already: an earlier job of this session wrote it"
+        context.journal.say(Level.NOTICE, words)
+        return session.update(outcome=Outcome.APPLIED)
+    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
+    proposal = context.tools.propose(FileTarget.of(context.cell), request)
+    edit = proposal.edit
+    decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))
+    differs = any(gain.differs for gain in decision.gains)
+    touched = _written_since(context, session)
+    if differs and touched:
+        decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
+    context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
+    after = sha256(edit.after)
+    target = PlannedWrite(
+        file=str(edit.file),
+        base_sha256=edit.base_sha256,
+        after_sha256=after,
+        looked_at=edit.base,
+        unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
+    )
+    _write_proposal(session, proposal, after)
+    # Before anything is written: after a kill, the digest of the file shows whether it was.
+    session = session.update(decision=decision, target=target)
+    closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
+    if closed:
+        for refusal in closed:
+            context.journal.say(Level.ERROR, "a check failed", gate=refusal.gate.value, text=str(refusal))
+        session.update(outcome=Outcome.REFUSED)
+        _apply(context, proposal, now)  # which refuses it, and writes that down
+    if not edit.has_effect or not differs:
+        return session.update(outcome=Outcome.UNCHANGED)
+    if proposal.refusals or not context.operator.approve(proposal, touched=touched):
+        record_session(
+            context.target.history.audit,
+            AuditAction.PROPOSED,
+            at=context.tools.now(),
+            who=context.who,
+            subject=str(resolve_links(context.target.file)),
+            details={
+                "session": session.state.session,
+                "calibration_sha256": digest,
+                "sha256_before": target.base_sha256,
+                "sha256_after": after,
+            },
+        )
+        context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
+        return session.update(outcome=Outcome.PROPOSED)
+    written = _apply(context, proposal, now)
+    if written is not None:
+        context.journal.say(
+            Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup)
+        )
+        if written.not_in_history:
+            words = "the history does not have this write; the next job, apply or history --add enters it"
+            context.journal.say(Level.WARNING, words, text=written.not_in_history)
+    return session.update(outcome=Outcome.APPLIED)
+
+
+def _apply(context: SessionContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
+    with writing(proposal.edit.file):
+        return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
+
+
+def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
+    """Judge which gains differ significantly from the controller's (`daq.writeback.judgement`), each among all axes."""
+    judged, words = judge(proposal.edit.changes, known)
+    gains = tuple(
+        JudgedGain(
+            axis=change.axis,
+            unit=change.unit,
+            old=change.old,
+            new=change.new,
+            old_std=known.stds[change.axis],
+            new_std=change.std,
+            change_percent=_finite(judged[change.axis].percent),
+            drift_sigma=_finite(judged[change.axis].sigmas),
+            differs=judged[change.axis].significant,
+        )
+        for change in proposal.edit.changes
+        if change.axis in judged
+    )
+    return Decision(gains=gains, remark=words)
+
+
+def _written_since(context: SessionContext, session: Session) -> bool:
+    """Whether the audit has a write or a rollback of the controller's file since the session began.
+
+    An earlier job may have been killed right after its write, and an operator may have undone that since. The file is
+    then as it was before, and the job must not repeat the write.
+    """
+    entries = read_audit(context.target.history.audit)
+    begun = [
+        index
+        for index, entry in enumerate(entries)
+        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
+    ]
+    file = str(resolve_links(context.target.file))
+    ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
+    # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
+    return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
+
+
+def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
+    """Write the change beside the calibration, as JSON and as a diff."""
+    report = ProposalReport(
+        file=str(proposal.edit.file),
+        base_sha256=proposal.edit.base_sha256,
+        after_sha256=after_sha256,
+        changes=[_proposed_gain(change) for change in proposal.edit.changes],
+        refusals=[FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals],
+    )
+    with writing(session.folder / PROPOSAL):
+        replace_file(session.folder / PROPOSAL, json_text(report).encode())
+        replace_file(session.folder / DIFF, proposal.edit.diff.encode())
+
+
+def _proposed_gain(change: GainChange) -> ProposedGain:
+    return ProposedGain(
+        axis=change.axis,
+        key=change.key,
+        old=change.old,
+        new=change.new,
+        std=change.std,
+        unit=change.unit,
+        change_percent=change.change_percent,
+    )
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

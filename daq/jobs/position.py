@@ -1,0 +1,57 @@
+"""Where a guided session is: its stage, the next step of the operator, and how σ falls. For terminal and console."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from daq.config.recalibration import PlannedRun
+from daq.documents.session_state import Block, GuidedState, Outcome
+
+
+class StageName(Enum):
+    """Stages of a guided session."""
+
+    RECORD = "record"
+    IDENTIFY = "identify"
+    WRITE = "write"
+    ACCEPT = "accept"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """Where a session is."""
+
+    stage: StageName
+    next_step: str  #: what happens next, and what the operator does for it
+
+
+def sessions_folder(cell_file: Path) -> Path:
+    """Return the folder of the guided sessions of a cell, where none was named."""
+    return cell_file.with_suffix(".sessions")
+
+
+def on_flange(run: PlannedRun | Block) -> str:
+    """Say what a run needs on the flange."""
+    if run.payload is None:
+        return "NOTHING on the flange"
+    return f"{run.payload.upper()} ({run.mass_kg:g} kg) on the flange"
+
+
+def position_of(state: GuidedState) -> Position:
+    """Find the stage that a session is in, by what its state has and lacks."""
+    if state.outcome is not None and state.is_over:
+        return Position(StageName.ENDED, f"nothing: the session has ended, {state.outcome.value}")
+    recorded = {run.name for run in state.runs}
+    waiting = [block for block in state.blocks if block.name not in recorded]
+    if waiting:
+        return Position(StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}")
+    if not state.complete:
+        return Position(StageName.RECORD, "nothing yet: the next block is being prepared")
+    if state.outcome is Outcome.APPLIED:
+        return Position(StageName.ACCEPT, f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new")
+    if state.decision is None:
+        return Position(StageName.IDENTIFY, "nothing: the gains are being identified")
+    return Position(StageName.WRITE, "look at the change, and type yes in the terminal to write it")

@@ -1,0 +1,154 @@
+"""What a person reads of a session, and where the console says that it is."""
+
+from __future__ import annotations
+
+import io
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from daq.console.results import Results
+from daq.documents.session_state import (
+    Acceptance,
+    Block,
+    Decision,
+    Fitted,
+    GainSoFar,
+    GuidedState,
+    Outcome,
+    RecordedRun,
+)
+from daq.jobs.guided import left_s
+from daq.jobs.journal import Form, Level
+from daq.jobs.position import StageName, position_of
+from daq.jobs.session import Session, save
+from daq.jobs.story import SENTENCES, Story
+from tests.daq.jobs.made_session import MadeSession, made_session_rig, run_session
+from tests.daq.jobs.rig import BEGAN, Rig
+
+GAINS = (
+    {"axis": "J1", "unit": "Nm/A", "value": 33.9, "std_percent": 0.4, "target_percent": 0.5},
+    {"axis": "J6", "unit": "Nm/A", "value": 6.79, "std_percent": 1.0, "target_percent": 0.5},
+)
+
+
+def story() -> tuple[Story, io.StringIO]:
+    stream = io.StringIO()
+    return Story(stream, Form.TEXT, lambda: datetime(2026, 1, 5, tzinfo=UTC)), stream
+
+
+def test_the_worst_gain_comes_first_with_what_it_lacks() -> None:
+    journal, stream = story()
+    journal.say(Level.INFO, "gains so far", gains=list(GAINS), blocks=3, motion_s=60.0, left_s=180.0)
+    title, worst, other, outlook = stream.getvalue().strip().splitlines()
+    assert title == "Gains after 3 blocks, 60 s of motion:"
+    assert worst.split() == ["J6", "6.79", "Nm/A", "±", "1.00", "%", "not", "yet:", "2.0", "×", "the", "target"]
+    assert other.split() == ["J1", "33.9", "Nm/A", "±", "0.40", "%", "✓"]
+    assert "J6 needs the longest: about 180 s more" in outlook
+
+
+def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
+    """σ twice the target needs four times the motion, three times of it still to come."""
+    gains = [GainSoFar.model_validate(gain) for gain in GAINS]
+    assert left_s(gains, 60.0) == pytest.approx(180.0)
+    assert left_s(gains[:1], 60.0) == 0.0
+
+
+def test_a_warning_is_said_once_and_what_is_for_programs_never() -> None:
+    journal, stream = story()
+    for _ in range(2):
+        journal.say(Level.WARNING, "warning of the recorder", text="no rated torque")
+    journal.say(Level.INFO, "mounted", payload="disc")
+    journal.say(Level.ERROR, "something new", text="with its reason\x1b[2J")
+    assert stream.getvalue().splitlines() == ["! no rated torque", "! something new: with its reason\\x1b[2J"]
+
+
+def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, MadeSession]) -> None:
+    """Each event of a real session has its fields as the sentences expect them, and no line has a time stamp."""
+    rig, _ = whole_session
+    journal, stream = story()
+    of_journal = {"time", "level", "event", "session", "step"}
+    for event in rig.events:
+        fields = {key: value for key, value in event.items() if key not in of_journal}
+        journal.say(Level[event["level"].upper()], event["event"], **fields)
+    text = stream.getvalue()
+    assert "Gains after 3 blocks" in text
+    assert "Every gain is within ± 5 %" in text
+    assert "Accepted" in text
+    assert "kg more on the flange than without load" in text
+    assert "2026-" not in "".join(line for line in text.splitlines() if "/" not in line)
+    assert {event["event"] for event in rig.events} & set(SENTENCES)
+
+
+def state(**changed: object) -> GuidedState:
+    blocks = (
+        Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="plan-1.yaml"),
+        Block(name="block-2-loaded", payload="disc", mass_kg=4.59, holdout=False, plan="plan-2.yaml"),
+    )
+    made = GuidedState(
+        session="s",
+        cell="demo",
+        configuration_sha256="",
+        began=BEGAN.isoformat(),
+        attempt_began=BEGAN.isoformat(),
+        blocks=blocks,
+        runs=tuple(_run(block.name) for block in blocks),
+    )
+    return made.model_copy(update=changed)
+
+
+def _run(name: str) -> RecordedRun:
+    return RecordedRun(name=name, sha256="", attempts=1, samples=1, lost_cycles=0, missing=())
+
+
+ENDED = BEGAN.isoformat()
+FITTED = Fitted(calibration_sha256="", sentences=())
+DECIDED = {"complete": True, "fitted": FITTED, "decision": Decision(gains=(), remark="")}
+ACCEPTED = Acceptance(
+    log_sha256="", scales=(), old_error_percent=5.0, new_error_percent=2.0, accepted=True, remark="good"
+)
+
+
+@pytest.mark.parametrize(
+    ("changed", "stage", "step"),
+    [
+        ({"runs": ()}, StageName.RECORD, "NOTHING on the flange, then the robot moves: block-1-bare"),
+        ({"runs": (_run("block-1-bare"),)}, StageName.RECORD, "DISC (4.59 kg) on the flange"),
+        ({}, StageName.RECORD, "the next block is being prepared"),
+        ({"complete": True}, StageName.IDENTIFY, "being identified"),
+        (DECIDED, StageName.WRITE, "type yes"),
+        ({**DECIDED, "outcome": Outcome.APPLIED}, StageName.ACCEPT, "moves that are new"),
+        ({**DECIDED, "outcome": Outcome.APPLIED, "ended": ENDED}, StageName.ACCEPT, "moves that are new"),
+        ({**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED}, StageName.ENDED, "applied"),
+        ({**DECIDED, "outcome": Outcome.PROPOSED, "ended": ENDED}, StageName.ENDED, "proposed"),
+    ],
+)
+def test_the_position_of_a_session_is_what_its_state_lacks(
+    changed: dict[str, object], stage: StageName, step: str
+) -> None:
+    position = position_of(state(**changed))
+    assert position.stage is stage
+    assert step in position.next_step
+
+
+def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    results = Results(rig.cell_file, rig.cell)
+    assert results.document()["guided"] is None
+    run_session(rig)
+    shown = results.document()
+    assert shown["problems"] == []
+    assert shown["guided"]["stage"] == "ended"
+    assert shown["guided"]["accepted"] is True
+    assert shown["guided"]["left_s"] == 0.0
+    (progress,) = shown["guided"]["progress"]
+    assert progress["motion_s"] == 18.0
+    assert len(progress["std_percent"]) == len(shown["guided"]["axes"]) == 6
+    assert shown["session"]["kind"] == "Session"
+    waiting = state(runs=(_run("block-1-bare"),))
+    folder = rig.session.folder
+    save(Session(folder, waiting.model_copy(update={"session": folder.name})))
+    assert results.document()["guided"]["next_step"].startswith("DISC (4.59 kg) on the flange")
