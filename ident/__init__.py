@@ -59,8 +59,10 @@ if TYPE_CHECKING:
     from ident.estimators.estimate import Estimate as Estimate
     from ident.estimators.estimate import Identification as Identification
     from ident.estimators.estimate import RelativeError as RelativeError
+    from ident.estimators.growing import GrowingFit as GrowingFit
     from ident.estimators.identify import identify as identify
     from ident.estimators.method import Method as Method
+    from ident.estimators.quick import QuickGains as QuickGains
     from ident.estimators.turned_geometry import find_turned_geometry as find_turned_geometry
     from ident.model.bodies import Payload as Payload
     from ident.model.model import DriveTrain as DriveTrain
