@@ -15,7 +15,7 @@ from ident.equations.triangles import Triangles, triangle
 Cluster = tuple[FloatArray, ...]  #: The rows of each motor in one move, or their triangle
 
 
-def join_systems(first: System, second: System) -> System:
+def join_systems(first: System, second: System, *, continues_move: bool = False) -> System:
     """Return the system of the rows of both.
 
     R of two triangles below each other is R of all their rows. The gains do not depend on the order of the two. Their σ
@@ -23,6 +23,8 @@ def join_systems(first: System, second: System) -> System:
 
     Args:
         first, second: without instruments. A run that has rows in both counts as one run.
+        continues_move: the last cluster of the first and the first one of the second are parts of one move, which
+            counts as one cluster: its rows are correlated.
 
     Raises:
         ValueError: they have other unknowns or other payloads.
@@ -47,11 +49,14 @@ def join_systems(first: System, second: System) -> System:
         cluster_runs=tuple(cluster_runs),
         preload=first.preload + second.preload,
     )
+    last = len(first.clusters) - 1
+    if continues_move and cluster_runs[last : last + 1] == cluster_runs[last + 1 : last + 2]:
+        joined = _join_pairs(joined, [last])
     while len(joined.clusters) > 2 * MAX_CLUSTERS:
-        fewer = _join_neighbours(joined)
-        if len(fewer.clusters) == len(joined.clusters):
+        pairs = _neighbours(joined.cluster_runs)
+        if not pairs:
             break  # each run has one cluster
-        joined = fewer
+        joined = _join_pairs(joined, pairs)
     return joined
 
 
@@ -62,29 +67,50 @@ def _join_triangles(first: Triangles, second: Triangles) -> Triangles:
     return Triangles(tuple(factors), first.rows + second.rows)
 
 
-def _join_neighbours(system: System) -> System:
-    """Join clusters in pairs that follow each other in one run with one payload."""
+def _neighbours(cluster_runs: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the first of each pair of clusters that follow each other in one run; no cluster is in two pairs."""
+    pairs: list[int] = []
+    index = 0
+    while index < len(cluster_runs) - 1:
+        if cluster_runs[index] == cluster_runs[index + 1]:
+            pairs.append(index)
+            index += 1
+        index += 1
+    return pairs
+
+
+def _join_pairs(system: System, pairs: Sequence[int]) -> System:
+    """Join clusters with the ones that follow them.
+
+    Args:
+        system: with the clusters.
+        pairs: index of the first cluster of each pair, ascending.
+    """
     clusters: list[Cluster] = []
     cluster_runs: list[tuple[int, int]] = []
     preload: list[FloatArray] = []
     index = 0
     while index < len(system.clusters):
-        run = system.cluster_runs[index]
-        following = system.cluster_runs[index + 1 : index + 2]
-        end = index + 1
-        if following == (run,):
-            end = index + 2
-        clusters.append(_join_clusters(system.clusters[index:end], is_redundant=bool(system.preload)))
-        cluster_runs.append(run)
-        if system.preload:
-            preload.append(np.concatenate(system.preload[index:end]))
-        index = end
+        cluster = system.clusters[index]
+        own_preload = system.preload[index : index + 1]
+        cluster_runs.append(system.cluster_runs[index])
+        if index in pairs:
+            cluster = _join_clusters(cluster, system.clusters[index + 1], is_redundant=bool(system.preload))
+            own_preload = system.preload[index : index + 2]
+            index += 1
+        clusters.append(cluster)
+        if own_preload:
+            preload.append(np.concatenate(own_preload))
+        index += 1
     return replace(system, clusters=tuple(clusters), cluster_runs=tuple(cluster_runs), preload=tuple(preload))
 
 
-def _join_clusters(clusters: Sequence[Cluster], *, is_redundant: bool) -> Cluster:
-    """One cluster of one or two; of a redundant robot with all rows, as each has a preload of its own."""
-    of_motors = zip(*clusters, strict=True)
-    if is_redundant:
-        return tuple(np.concatenate(rows) for rows in of_motors)
-    return tuple(triangle(rows, rows[0].shape[1]) for rows in of_motors)
+def _join_clusters(first: Cluster, second: Cluster, *, is_redundant: bool) -> Cluster:
+    """One cluster of two; of a redundant robot with all rows, as each has a preload of its own."""
+    joined = []
+    for upper, lower in zip(first, second, strict=True):
+        if is_redundant:
+            joined.append(np.concatenate((upper, lower)))
+        else:
+            joined.append(triangle((upper, lower), upper.shape[1]))
+    return tuple(joined)

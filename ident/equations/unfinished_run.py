@@ -6,9 +6,8 @@ and the samples before a new row are filtered again with it. What is left of the
 signal: the impulse response of the low-pass decays as exp(−2π sin(π/2N) f t) for order N and cut-off f (Oppenheim &
 Schafer, Discrete-Time Signal Processing, §7.2), with N = 4 by a factor of 1e8 in SETTLED_PERIODS/f.
 
-Two things still differ from the same run read at its end. Where no standstill speed is declared, it is derived from the
-new part alone (`ident.data.dataset.standstill_speed`). A move that a new part divides counts as two, so σ differs a
-little.
+Where no standstill speed is declared, it is derived from the new part alone (`ident.data.dataset.standstill_speed`),
+and the rows may differ from those of the same run read at its end.
 """
 
 from __future__ import annotations
@@ -27,7 +26,8 @@ from ident.errors import DataUnfit
 from ident.model.model import Model
 
 SETTLED_PERIODS = 8.0  #: Periods of the position filter's cut-off after which a border no longer shows
-SHORTEST_S = 2.01  #: Beside a window of the decimator, what is filtered together; `differentiate` refuses less than 2 s
+SHORTEST_S = 2.01
+"""Shortest part that is filtered, and a window of the decimator: `differentiate` refuses less than 2 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,7 @@ class NewRows:
     progress: RunProgress  #: with these rows
     #: Part of the run that the rows come from, and the rows piece by piece; None where no new row counts.
     built: tuple[Dataset, tuple[Rows, ...]] | None
+    continues_move: bool = False  #: the first of them belong to the move of the last ones before
 
 
 def new_rows(
@@ -88,14 +89,19 @@ def new_rows(
     data = differentiate(part, model.drive_train, conditioning)
     data = replace(data, rate_hz=before.rate_hz)
     row_filter(data, conditioning)  # refuses a run that is too short for it
-    use, _ = row_masks(model, data, conditioning)
+    use, motor_use = row_masks(model, data, conditioning)
     rows = np.arange(first, first + use.shape[1])
     is_new = (rows >= before.rows) & (rows < end)
     progress = replace(before, rows=end, is_complete=is_complete)
     if not np.any(use & is_new):
         return NewRows(progress, None)  # every joint rests
     pieces = _only_new(model, data, conditioning, is_new)
-    return NewRows(progress, (data, pieces))
+    move = data.move[filter_.centres(len(data.time_s))]
+    counts = motor_use.any(axis=0)
+    moves_before = move[counts & (rows < before.rows)]
+    moves_now = move[counts & is_new]
+    continues = len(moves_before) > 0 and len(moves_now) > 0 and bool(moves_before[-1] == moves_now[0])
+    return NewRows(progress, (data, pieces), continues)
 
 
 def _samples_from(run: Run, first: int) -> Run:

@@ -61,7 +61,9 @@ class GrowingFit:
         standard = self.standard
         if found.built is not None:
             new = reduce_built(self.model, [found.built], payloads=self.payloads)
-            standard = new if standard is None else join_systems(standard, new)
+            if standard is not None:
+                new = join_systems(standard, new, continues_move=found.continues_move)
+            standard = new
         others = tuple(other for other in self.runs if other.name != run.name)
         return replace(self, standard=standard, runs=(*others, found.progress))
 
