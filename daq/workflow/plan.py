@@ -23,7 +23,6 @@ from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
-    RUNS,
     Experiment,
     JointLimits,
     PlannedMove,
@@ -38,6 +37,7 @@ from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
 from ident.planning.clearance import CLOSURES, Checker, Obstruction
+from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
 
 
@@ -95,6 +95,37 @@ class Draft:
     informations: tuple[FloatArray, ...]  #: of moves[1:]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanGoal:
+    """Purpose of a plan: σ of each gain relative to its target, together with all that was recorded before."""
+
+    #: Information of what has been recorded (`ident.planning.target.recorded_information`) with the design of the
+    #: experiment, shape (p, p).
+    recorded: FloatArray
+    target_percent: FloatArray  #: σ that each gain shall reach [%], inf for one that does not matter, shape (n,)
+
+    @classmethod
+    def of_first(cls, design: Design) -> PlanGoal:
+        """Return the goal of a first plan: nothing was recorded before, and all gains matter alike."""
+        recorded = np.zeros((design.size, design.size))
+        return cls(recorded, np.ones(len(design.expectation.gains)))
+
+    def ratio(self, std_percent: FloatArray) -> FloatArray:
+        """Return σ over target of each gain, shape (n,); zero for one that does not matter."""
+        ratio = np.zeros(len(std_percent))
+        matters = np.isfinite(self.target_percent)
+        ratio[matters] = std_percent[matters] / self.target_percent[matters]
+        return ratio
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetBox:
+    """Least and largest joint positions that targets may have [rad; m of a prismatic joint], shape (n,) each."""
+
+    lower: FloatArray
+    upper: FloatArray
+
+
 class Search:
     """Random moves, and their exchange."""
 
@@ -105,6 +136,8 @@ class Search:
         duration_s: float,
         speed: float,
         largest_condition: float,
+        goal: PlanGoal,
+        box: TargetBox,
     ) -> None:
         self._experiment = experiment
         self._cell = experiment.cell
@@ -112,7 +145,9 @@ class Search:
         self._duration_s = duration_s
         self._speed = speed
         self._largest_condition = largest_condition
-        self._low, self._high = JointLimits.of(self._cell).targets()
+        self._goal = goal
+        self._low = box.lower
+        self._high = box.upper
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
@@ -174,10 +209,10 @@ class Search:
 
     def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
         """Cost of the search, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
-        information = np.sum(draft.informations, axis=0)
+        information = self._goal.recorded + np.sum(draft.informations, axis=0)
         found = self._experiment.design.std_percent(information)
         # Unseen gains are as bad as each other; the norm of inf would hide the rest.
-        bounded = np.minimum(found, 1e6)
+        bounded = np.minimum(self._goal.ratio(found), 1e6)
         worst = np.max(bounded)
         value = float(worst * np.sum((bounded / worst) ** SHARPNESS) ** (1.0 / SHARPNESS))
         if value < to_beat:  # the condition can only raise it
@@ -324,6 +359,8 @@ def plan(
     largest_condition: float | None = None,
     largest_std_percent: float = LARGEST_STD_PERCENT,
     experiment: Experiment | None = None,
+    goal: PlanGoal | None = None,
+    box: TargetBox | None = None,
     progress: Callable[[int, float], None] = lambda _done, _worst: None,
 ) -> Plan:
     """Choose moves that let the worst gain be known as well as the time allows.
@@ -340,7 +377,11 @@ def plan(
         speed: share of the limits that the fastest moves may use.
         largest_condition: a plan worse than this is refused; that of the kind of robot when None.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
-        experiment: that the plan is for, None for the one with the cell's first payload.
+        experiment: that the plan is for, None for the one with the cell's first payload. After a fit, its design may
+            be that of `daq.workflow.verdicts.design_after`; ``mounted`` says what the moves are made with.
+        goal: target σ of each gain, and what has been recorded before; None for a first plan. With a goal, the worst
+            gain is that with the largest σ over target, and the plan's deviations are those of all recordings together.
+        box: joint positions between which the targets stay, inside the limits; None for all that the limits allow.
         progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
@@ -350,19 +391,21 @@ def plan(
     experiment = experiment or experiment_of(cell)
     if largest_condition is None:
         largest_condition = LARGEST_CONDITION if cell.chain is None else LARGEST_CONDITION_OF_CHAIN
-    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
+    goal = goal or PlanGoal.of_first(experiment.design)
+    room = _room(cell, duration_s, box)
+    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition, goal, room)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
-    information = np.sum(experiment.informations(draft.paths), axis=0)
+    information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
     predicted = experiment.design.std_percent(information)
     found = experiment.design.condition(information)
-    worst = int(np.argmax(predicted))
+    worst = int(np.argmax(goal.ratio(predicted)))
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if not found <= largest_condition:
         words = f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges"
         raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
     if not predicted[worst] <= largest_std_percent:
         words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
-        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], RUNS)])
+        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)])
         remedy = ". ".join((remedy, *judged.sentences(cell.axis_names)))
         raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
     return Plan(
@@ -374,6 +417,19 @@ def plan(
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
     )
+
+
+def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
+    """Return the least and the largest targets: those of the joint limits, and inside a box."""
+    lower, upper = JointLimits.of(cell).targets()
+    if box is None:
+        return TargetBox(lower, upper)
+    room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
+    outside = [axis.name for axis, is_empty in zip(cell.axes, room.lower > room.upper, strict=True) if is_empty]
+    if outside:
+        found = f"a box of targets outside the joint limits of {', '.join(outside)}"
+        raise _unfit(cell, duration_s, found, "a box inside the limits", "give a box that they allow")
+    return room
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
