@@ -16,7 +16,7 @@ Algebra Appl. 88/89 (1987); Van Huffel & Vandewalle, The Total Least Squares Pro
 
 The expected errors come from the residuals of the solution before. The fixed point of these passes is the estimate of
 `ml`; PASSES of them are close to it. `ls` and `wls` are as linear, but noise of the currents makes their gains too
-small, by ten per cent where `ml` is off by one (docs/evidence/estimators.md).
+small, by ten per cent and more where `ml` is off by one (docs/evidence/stopping.md).
 
 A redundantly driven robot has unknown preload in each row, so its gains are those of `tls`. σ is that of `ml`, by
 leaving out one move at a time: rows are correlated, moves hardly.
@@ -168,7 +168,7 @@ def _solve_once(system: System, weight: FloatArray, error_in_gains: FloatArray) 
         parts.append(weight[motor] * np.concatenate((-factor[:, 1:], drive), axis=1))
     stacked = np.concatenate(parts)
     payload = stacked.shape[1] - count - 1  # index of the column −T W_kL χ_kL; those of the gains follow it
-    # In unit columns, as kilograms are beside kg m², and gains in units of their errors.
+    # Unit columns, because kg and kg m² differ in size; those of the gains in units of their errors.
     scale = np.linalg.norm(stacked, axis=0)
     scale[scale == 0.0] = 1.0
     scale[-count:] = np.sqrt(error_in_gains)
