@@ -1,7 +1,7 @@
 """Simulated cells that are recorded in blocks, with the gains after each move and each block.
 
 Blocks are without load, loaded, loaded, without load, and so on, of random moves (tests/ident/pieces.py). A fit that
-grows is looked at after each move with the quick estimate, and after each block with `ml`.
+grows gives the quick estimate after each move, and that of `ml` after each block.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python -m tests.studies.stopping_study --arm three --minutes 30
 
-Each cell has noise and moves of its own (stopping_cells.py). σ is looked at after each move or block, and the first
+Each cell has noise and moves of its own (stopping_cells.py). σ is judged after each move or block, and the first
 look at which every σ is at the target ends the recording. A σ that happens to be small ends it too early. What is
 finished is not done again; `--shard 2/4` takes every fourth cell from the second on.
 """
@@ -73,7 +73,7 @@ FIXED = {"quick, each move": (QUICK, "quick, length fixed before"), "ml, each bl
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What the gains are like where the recordings of an arm end."""
+    """Quality of the gains where the recordings of an arm end."""
 
     cells: int  #: that reached the target
     recorded_s: tuple[float, float, float]  #: 5, 50 and 95 % of the cells need at most so long

@@ -96,7 +96,7 @@ def test_pieces_in_any_order_give_the_gains_of_all_rows_at_once(
 
 @settings(deadline=None, max_examples=12)
 @given(lengths=st.lists(st.integers(3, LONG_SAMPLES - 1), max_size=6))
-def test_runs_that_were_looked_at_while_they_grew_are_the_whole_runs(
+def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(
     small_truth: Truth, long_runs: tuple[Run, ...], whole: GrowingFit, lengths: list[int]
 ) -> None:
     """At any moments: borders change nothing of the size of σ, and no row is lost or counted twice."""
