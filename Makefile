@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study weigh-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study crash-study kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study weigh-study stopping-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -47,6 +47,7 @@ help:
 	@echo "make real-study  effects found on real robots, judged where the arm was elsewhere (docs/evidence/real.md); needs the recordings; resumable, half an hour"
 	@echo "make geometry-study  wrong zeros, tilted gravity and late signals on four robots: named, and the gains; resumable, hours"
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
+	@echo "make stopping-study  gains and their error bars where a recording ends as soon as every error bar is at its target (docs/evidence/stopping.md); resumable, ten minutes"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
@@ -169,6 +170,9 @@ geometry-study: setup
 weigh-study: setup
 	$(BIN)/python -m tests.studies.weigh_study --arm three
 	$(BIN)/python -m tests.studies.weigh_study --arm tx40
+
+stopping-study: setup
+	$(BIN)/python -m tests.studies.stopping_study
 
 loop-noise-study: setup
 	$(BIN)/python -m tests.studies.loop_noise

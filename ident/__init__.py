@@ -16,6 +16,7 @@ Arrays over time have the shape (n_samples, n_axes) everywhere: in `Run`, `Motio
 `predict_torque` and `predict_current` return. Columns of the equations (`Model.regressor`, `Observation`) put the joint
 first and time last. Units are SI and in the names; a prismatic axis has m for rad and N for Nm.
 
+`GrowingFit` follows a recording while it goes on: gains ± σ after each move, or why nothing fixes them yet.
 `find_effects` looks for torques that the declared model lacks, in the rows that `gather` collects. `calibration_of`
 makes the `Calibration` with which `predict_torque`, `predict_current`, `weigh` and `external_torque` work. Errors are
 `IdentificationError` and its kinds in `ident.errors`.
@@ -59,8 +60,10 @@ if TYPE_CHECKING:
     from ident.estimators.estimate import Estimate as Estimate
     from ident.estimators.estimate import Identification as Identification
     from ident.estimators.estimate import RelativeError as RelativeError
+    from ident.estimators.growing import GrowingFit as GrowingFit
     from ident.estimators.identify import identify as identify
     from ident.estimators.method import Method as Method
+    from ident.estimators.quick import QuickGains as QuickGains
     from ident.estimators.turned_geometry import find_turned_geometry as find_turned_geometry
     from ident.model.bodies import Payload as Payload
     from ident.model.model import DriveTrain as DriveTrain

@@ -173,6 +173,7 @@ class Experiment:
     row_s: float  #: time between two rows of the observation [s]
     edge_s: float  #: how long after a standstill rows begin to count [s]
     remarks: tuple[str, ...]  #: what was assumed, in words
+    mounted: tuple[int | None, ...] = RUNS  #: what is mounted at each repetition of the moves: payload or None
 
     def excitation(self, paths: Sequence[Trapezoid], thinning: int = 1) -> tuple[Excitation, tuple[slice, ...]]:
         """Rows of several moves, one after the other, and which of them belong to which move."""
@@ -186,12 +187,12 @@ class Experiment:
         return Excitation(motion, use), slices
 
     def informations(self, paths: Sequence[Trapezoid], thinning: int = 1) -> list[FloatArray]:
-        """Excitation of each move, without load and with the payload, all from one regressor."""
+        """Information of each move with everything that is mounted in turn, all from one regressor."""
         if not paths:
             return []
         excitation, slices = self.excitation(paths, thinning)
         whitened = self.design.whitened(excitation)
-        return [thinning * self.design.information_of(whitened[:, :, part], RUNS) for part in slices]
+        return [thinning * self.design.information_of(whitened[:, :, part], self.mounted) for part in slices]
 
     def _use(self, path: Trapezoid, time_s: FloatArray) -> BoolArray:
         """Rows of each motor that count; the same rule as ident/equations/rows.py, for moves from rest to rest."""

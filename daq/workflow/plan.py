@@ -26,7 +26,6 @@ from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
-    RUNS,
     CheckedScene,
     Experiment,
     JointLimits,
@@ -43,6 +42,7 @@ from drivers.move import Trapezoid
 from ident.arrays import FloatArray
 from ident.model.robot import Robot
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
+from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
 from ident.plausible import format_at_limit
 
@@ -102,6 +102,37 @@ class Draft:
     informations: tuple[FloatArray, ...]  #: of moves[1:]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanGoal:
+    """Purpose of a plan: σ of each gain relative to its target, together with all that was recorded before."""
+
+    #: Information of what has been recorded (`ident.planning.target.recorded_information`) with the design of the
+    #: experiment, shape (p, p).
+    recorded: FloatArray
+    target_percent: FloatArray  #: σ that each gain shall reach [%], inf for one that does not matter, shape (n,)
+
+    @classmethod
+    def of_first(cls, design: Design) -> PlanGoal:
+        """Return the goal of a first plan: nothing was recorded before, and all gains matter alike."""
+        recorded = np.zeros((design.size, design.size))
+        return cls(recorded, np.ones(len(design.expectation.gains)))
+
+    def ratio(self, std_percent: FloatArray) -> FloatArray:
+        """Return σ over target of each gain, shape (n,); zero for one that does not matter."""
+        ratio = np.zeros(len(std_percent))
+        matters = np.isfinite(self.target_percent)
+        ratio[matters] = std_percent[matters] / self.target_percent[matters]
+        return ratio
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetBox:
+    """Least and largest joint positions that targets may have [rad; m of a prismatic joint], shape (n,) each."""
+
+    lower: FloatArray
+    upper: FloatArray
+
+
 class Search:
     """Random moves, and their exchange."""
 
@@ -112,6 +143,8 @@ class Search:
         duration_s: float,
         speed: float,
         largest_condition: float,
+        goal: PlanGoal,
+        box: TargetBox,
     ) -> None:
         self._experiment = experiment
         self._cell = experiment.cell
@@ -119,7 +152,9 @@ class Search:
         self._duration_s = duration_s
         self._speed = speed
         self._largest_condition = largest_condition
-        self._low, self._high = JointLimits.of(self._cell).targets()
+        self._goal = goal
+        self._low = box.lower
+        self._high = box.upper
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
@@ -186,10 +221,10 @@ class Search:
 
     def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
         """Cost of the search, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
-        information = np.sum(draft.informations, axis=0)
+        information = self._goal.recorded + np.sum(draft.informations, axis=0)
         found = self._experiment.design.std_percent(information)
         # Unseen gains are as bad as each other; the norm of inf would hide the rest.
-        bounded = np.minimum(found, 1e6)
+        bounded = np.minimum(self._goal.ratio(found), 1e6)
         worst = np.max(bounded)
         value = float(worst * np.sum((bounded / worst) ** SHARPNESS) ** (1.0 / SHARPNESS))
         if value < to_beat:  # the condition can only raise it
@@ -387,6 +422,8 @@ def plan(
     largest_condition: float | None = None,
     largest_std_percent: float = LARGEST_STD_PERCENT,
     experiment: Experiment | None = None,
+    goal: PlanGoal | None = None,
+    box: TargetBox | None = None,
     progress: Callable[[int, float], None] = lambda _done, _worst: None,
 ) -> Plan:
     """Choose moves that let the worst gain be known as well as the time allows.
@@ -403,7 +440,11 @@ def plan(
         speed: share of the limits that the fastest moves may use.
         largest_condition: a plan worse than this is refused; that of the kind of robot when None.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
-        experiment: that the plan is for, None for the one with the cell's first payload.
+        experiment: that the plan is for, None for the one with the cell's first payload. After a fit, its design may
+            be that of `daq.workflow.verdicts.design_after`; ``mounted`` says what the moves are made with.
+        goal: target σ of each gain, and what has been recorded before; None for a first plan. With a goal, the worst
+            gain is that with the largest σ over target, and the plan's deviations are those of all recordings together.
+        box: joint positions between which the targets stay, inside the limits; None for all that the limits allow.
         progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
@@ -413,12 +454,14 @@ def plan(
     experiment = experiment or experiment_of(cell)
     if largest_condition is None:
         largest_condition = LARGEST_CONDITION if cell.chain is None else LARGEST_CONDITION_OF_CHAIN
-    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
+    goal = goal or PlanGoal.of_first(experiment.design)
+    room = _room(cell, duration_s, box)
+    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition, goal, room)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
-    information = np.sum(experiment.informations(draft.paths), axis=0)
+    information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
     predicted = experiment.design.std_percent(information)
     found = experiment.design.condition(information)
-    worst = int(np.argmax(predicted))
+    worst = int(np.argmax(goal.ratio(predicted)))
     if not found <= largest_condition:
         condition = format_at_limit(found, largest_condition, 0)
         words = f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
@@ -428,7 +471,7 @@ def plan(
     if not predicted[worst] <= largest_std_percent:
         percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
         words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
-        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], RUNS)])
+        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)])
         ways = ["allow more exchanges, wider joint limits or higher speed"]
         if np.isfinite(predicted[worst]):
             longer_s = longer_run_s(used_s, duration_s, float(predicted[worst]) / largest_std_percent)
@@ -483,6 +526,19 @@ def nearly_right_joints(robot: Robot) -> tuple[str, ...]:
         if EXACTLY_RIGHT < off.max() < NEARLY_RIGHT:
             found.append(joint.name)
     return tuple(found)
+
+
+def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
+    """Return the least and the largest targets: those of the joint limits, and inside a box."""
+    lower, upper = JointLimits.of(cell).targets()
+    if box is None:
+        return TargetBox(lower, upper)
+    room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
+    outside = [axis.name for axis, is_empty in zip(cell.axes, room.lower > room.upper, strict=True) if is_empty]
+    if outside:
+        found = f"a box of targets outside the joint limits of {', '.join(outside)}"
+        raise _unfit(cell, duration_s, found, "a box inside the limits", "give a box that they allow")
+    return room
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:

@@ -12,18 +12,17 @@ from daq.errors import ConfigurationError
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
 from daq.workflow.fit import Fit
 from ident.data.dataset import differentiate
+from ident.estimators.estimate import Identification
 from ident.model.bodies import LINK_PARAMETERS
 from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
 from ident.planning.gain_verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
 
 
-def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
+def design_after(found: Identification) -> Design:
+    """Return the design of further recordings after a fit with free gains: its gains, parameters and noise.
 
-    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
-    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
+    Effects are left out.
     """
-    found = fitted.identification
     estimate = found.estimate
     system = found.system
     independent = list(system.base.independent)
@@ -45,10 +44,19 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
         payloads=tuple(payloads),
         noise_a=effective_noise(noise, LAG_ONE),
     )
+    return Design(expectation, system.base)
+
+
+def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
+
+    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
+    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
+    """
     extra: tuple[ExtraMoves, ...] = ()
     with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
         extra = extra_moves(experiment_of(fitted.cell))
-    judged = verdicts(Design(expectation, system.base), list(_excitations(fitted)), extra)
+    judged = verdicts(design_after(fitted.identification), list(_excitations(fitted)), extra)
     true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
     return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
 

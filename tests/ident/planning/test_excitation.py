@@ -29,6 +29,7 @@ from ident.planning.excitation import (
     visible_base,
 )
 from ident.planning.gain_verdict import ExtraMoves, GainSource, Visibility, verdicts
+from ident.planning.target import recorded_information
 from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record, tx40_truth
 
@@ -145,6 +146,16 @@ def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, ti
         _excitation(np.random.default_rng(7), 20), (None, 0)
     )
     assert (design.std_percent(more) <= once * (1.0 + 1e-9)).all()
+
+
+def test_recorded_information_is_the_sum_of_the_runs() -> None:
+    design = _design(tx40_truth())
+    bare = _excitation(np.random.default_rng(1), 60)
+    loaded = _excitation(np.random.default_rng(2), 60)
+    found = recorded_information(design, [(bare, (None,)), (loaded, (0,))])
+    expected = design.information(bare, (None,)) + design.information(loaded, (0,))
+    assert found == pytest.approx(expected)
+    assert not recorded_information(design, []).any()
 
 
 def test_correlated_rows_say_less() -> None:
