@@ -88,8 +88,8 @@ class Person:
         """Ask for what the next block carries."""
         from daq.jobs.position import on_flange
 
-        say("")
-        say(f"── {run.name}: {on_flange(run)} ──", bold=True)
+        tell("")
+        tell(f"── {run.name}: {on_flange(run)} ──", bold=True)
         if self.asks_before_motion:
             todo = "Take off what is there" if run.payload is None else "Mount it if it is not mounted"
             ask(f"{todo}, leave the cell, then press Enter")
@@ -101,12 +101,12 @@ class Person:
             first_kg = _number(ask(f"Mass of {payload} read from the scale [kg]"))
             second_kg = _number(ask("The same once more"))
             if first_kg is None or first_kg != second_kg:
-                say("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
+                tell("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
                 continue
             refusal = _refused_mass(declared, first_kg)
             if not refusal:
                 return first_kg
-            say(refusal)
+            tell(refusal)
 
     def permit_motion(self, run: PlannedRun) -> str:
         """Ask once more before power comes on."""
@@ -126,7 +126,7 @@ class Person:
 
         show_proposal(proposal, output_console())
         if touched:
-            say("! The controller's file was written or rolled back since the session began.")
+            tell("! The controller's file was written or rolled back since the session began.")
         return ask(f"Type {YES} to write these gains to {proposal.edit.subject}, anything else to leave them") == YES
 
 
@@ -146,7 +146,7 @@ def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
     )
 
 
-def say(text: str, *, bold: bool = False) -> None:
+def tell(text: str, *, bold: bool = False) -> None:
     """Print a line for the operator."""
     typer.secho(printable(text), err=True, bold=bold)
 
@@ -214,8 +214,8 @@ def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
 
     def save_report(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
         certificate = save_certificate(cell_file, cell, fitted, changed, calibration, folder)
-        say("")
-        say(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
+        tell("")
+        tell(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
         open_page(folder / PAGE)
 
     def record_with_bar(request: RecordingRequest, **further: Any) -> Recorded:

@@ -24,7 +24,7 @@ class StandingState(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Acceptance:
+class RecordedAcceptance:
     """An entry of the audit log that accepts a calibration."""
 
     at: datetime  #: when, UTC
@@ -42,7 +42,7 @@ class Standing:
     ended: Event | None = None
     #: Gains that were at that place before the write, by axis; empty where the ledger does not have them.
     before: Mapping[str, float] = field(default_factory=dict)
-    acceptance: Acceptance | None = None  #: the last one
+    acceptance: RecordedAcceptance | None = None  #: the last one
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
 
     @property
@@ -129,11 +129,11 @@ def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, floa
     return before
 
 
-def _last_acceptance(entries: Sequence[AuditEntry], cell: str, digest: str) -> Acceptance | None:
+def _last_acceptance(entries: Sequence[AuditEntry], cell: str, digest: str) -> RecordedAcceptance | None:
     for entry in reversed(entries):
         if entry.action is not AuditAction.ACCEPTED or text_field(entry, "cell") != cell:
             continue
         at = at_of(entry)
         if at is not None and text_field(entry, "calibration_sha256") == digest:
-            return Acceptance(at, entry.who)
+            return RecordedAcceptance(at, entry.who)
     return None

@@ -97,7 +97,7 @@ def test_a_job_that_writes_makes_its_certificate_once_more(
         assert main(["apply", str(rig.cell_file), str(file), "--yes"]) == ExitCode.OK
         return Conclusion(Outcome.APPLIED, 0, None, "")
 
-    monkeypatch.setattr("daq.report.residual_page.save_report", save)
+    monkeypatch.setattr("daq.jobs.certificate.save_report", save)
     monkeypatch.setattr("daq.jobs.job.recalibrate", job)
     assert main(["recalibrate", str(rig.cell_file)]) == ExitCode.OK
     states = [compared.standing.state for compared, _ in pages]

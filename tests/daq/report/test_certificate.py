@@ -318,6 +318,10 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(ce
 
 
 def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(cell_file: Path) -> None:
+    controller = cell_file.parents[1] / "controllers" / "demo.yaml"
+    text = controller.read_text(encoding="utf-8")
+    commented = text.replace("# Nm at the joint per A", "# Nm at the joint per A, from the data sheet")
+    controller.write_text(commented, encoding="utf-8")
     calibration_file = calibration_for(cell_file)
     ready = _certificate(cell_file, calibration_file)
     _apply(cell_file, calibration_file)
@@ -340,7 +344,7 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(c
     assert not any("would be written" in text or "Ready" in text for text in texts)
     assert texts.count("differs from the previous gain") == 6
     assert [row.judged for row in certificate.shown] == [row.judged for row in ready.rows]
-    # The comments of the demo's controller file say where the earlier gains came from.
+    # The comments of this controller file say where the earlier gains came from.
     assert any("J1: “Nm at the joint per A, from the data sheet”" in text for text in texts)
 
 
