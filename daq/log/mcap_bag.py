@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 
 from daq.errors import LogForeign, LogTruncated, LogUnreadable
 from daq.log.container import HEAD_BYTES, LARGEST_RATIO, PlacedRecord, RecordFile
@@ -46,6 +46,7 @@ class McapBag(RecordFile):
         """Store the path, and where the content is if not there."""
         super().__init__(path, source)
         self.library = ""
+        self.has_entries = False  #: Attachments or metadata, with which a log of ours begins
         self.topics: dict[int, Topic] = {}
         self._schemas: dict[int, Schema] = {}
 
@@ -72,6 +73,8 @@ class McapBag(RecordFile):
                     if topic is None:
                         raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
                     yield BagMessage(offset, topic, record.log_time, record.data)
+                elif isinstance(record, Attachment | Metadata):
+                    self.has_entries = True
                 elif isinstance(record, Header):
                     self.library = record.library
                 elif isinstance(record, Schema):
@@ -196,7 +199,7 @@ def foreign_recording(path: Path) -> LogForeign | None:
     if SAMPLES_TOPIC in topics:
         return None
     if not topics:
-        return _foreign_beginning(path, bag.library)
+        return None if bag.has_entries else _foreign_beginning(path, bag.library)
     states = [topic for topic, has in topics.items() if has]
     found = f"a bag of {bag.library or 'another program'} with " + (
         f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}" if states else ", ".join(topics)
