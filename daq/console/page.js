@@ -428,6 +428,7 @@ function drawPrecision(guided) {
     picture.append(drawn("text", { x: left - 6, y: y(value) + 4, "text-anchor": "end" }, `${value} %`));
   }
   picture.append(drawn("line", { class: "target", x1: left, x2: width - right, y1: y(target), y2: y(target) }));
+  picture.append(drawn("text", { x: width - right + 6, y: y(target) + 4 }, "target"));
   const ends = axes.map((name, k) => ({ name, k, value: progress.at(-1).std_percent[k] })).sort((a, b) => b.value - a.value);
   let free = 0;
   for (const { name, k, value } of ends) {

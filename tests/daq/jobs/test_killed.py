@@ -29,7 +29,8 @@ from tests.daq.jobs.rig import Rig
 
 pytestmark = pytest.mark.processes
 
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"})
+OF_GUIDED_SESSIONS = {"preview", "look", "validate"}  #: Tools that a job does not call
+CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"} | OF_GUIDED_SESSIONS)
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 
 
