@@ -492,8 +492,8 @@ def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, colu
     whole = _on_screen(residual_view(made.fitted, made.account, calibration), 10_000)
     # What does not fit a narrow screen is counted; what is there has the words of a wide one.
     shown = "\n".join(line for line in screen.lines if "sentences more:" not in line)
-    words = iter(whole.text.split())
-    assert all(word in words for word in shown.split())
+    wide = iter(whole.text.split())
+    assert all(word in wide for word in shown.split())
     assert ("sentences more:" in screen.text) == (shown.split() != whole.text.split())
     for words in ("CHECK loaded-2", "J3 has a spring", "J2 has friction", "J5 has a torque", "Currents were sampled"):
         assert words in whole.text

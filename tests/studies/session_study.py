@@ -1,0 +1,291 @@
+"""How long a guided session takes, beside the way step by step, and whether stopping when it is precise bends a gain.
+
+    python -m tests.studies.session_study --only TX-40 --seeds 1 2
+    python -m tests.studies.session_study --shard 1/4 --minutes 60      goes on where it ended
+
+Each shipped robot is calibrated over the driver by `daq.jobs.calibrate.calibrate`, until σ of every gain is 0.5 %. The
+time is that of the motion, and three minutes for each change of the payload. Step by step it is the shortest of five
+durations of a plan whose three runs (bare, loaded, held out) give every gain within 1 % of the truth. Both ways have
+the same plant, noise of their own, and plans of their own. Layout: out/session-study/<robot>-<seed>.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.config.cell import Cell
+from daq.config.cell_buses import bus_address
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.jobs.calibrate import calibrate
+from daq.jobs.context import Tools
+from daq.jobs.guided import GuidedSettings, guided
+from daq.jobs.journal import Form, Journal
+from daq.jobs.operator import GivenAnswers
+from daq.jobs.recording import calibration_of_session
+from daq.report.residual_page import save_report
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.fit import close_loop, fit
+from daq.workflow.plan import plan
+from daq.workflow.record import Recorded, RecordingRequest, record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
+from ident.errors import IdentificationError
+from tests.studies.any_robot import ROBOTS, StudiedRobot
+from tests.studies.fingerprint import digest, digest_of_source, made_once
+from tests.studies.output import print_line
+from tests.studies.side_by_side import Shard, shard
+from tests.studies.study_rows import work_off
+
+OUT = Path("out/session-study")
+SEEDS = tuple(range(1, 21))
+TARGET_PERCENT = 0.5
+TRUE_ERROR_PERCENT = 1.0
+CHANGE_S = 180.0  #: For each change of the payload
+DURATIONS_S = (10.0, 20.0, 40.0, 80.0, 160.0)
+BLOCK_S = 10.0
+EXCHANGES = 200
+NO_CONDITION = 1e6  #: Of mixed units; how well the gains are seen is judged by their σ
+NO_STD_PERCENT = 100.0  #: A short block need not show every gain: blocks are fitted together
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    """A simulated robot that is there while it is recorded, with the payload that a run names."""
+
+    robot: StudiedRobot
+    seed: int
+
+    def record(self, request: RecordingRequest, number: int, **further: Any) -> Recorded:
+        """Record a run over the driver; its number makes the noise."""
+        mounted = None if request.payload is None else request.payload.name
+        spec = load_simulation(shipped_simulation(self.robot.simulation), mounted)
+        axes = tuple(replace(axis, current_noise_a=self.robot.noise * axis.current_noise_a) for axis in spec.axes)
+        bus = open_bus(bus_address(request.cell))
+        try:
+            with SimulatedCell(replace(spec, axes=axes, seed=1000 * self.seed + number), bus):
+                return record(request, **further)
+        finally:
+            bus.shutdown()
+
+    def truth(self, cell: Cell) -> dict[str, float]:
+        """True gain by axis."""
+        spec = load_simulation(shipped_simulation(self.robot.simulation))
+        return {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+
+
+def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
+    """Both ways for one seed."""
+    shutil.copytree(shipped_configurations(), folder / "configs")
+    cell_file = folder / "configs" / "cells" / f"{robot.cell}.yaml"
+    cell = load_cell(cell_file)
+    plant = Plant(robot, seed)
+    return {
+        "robot": robot.name,
+        "seed": seed,
+        "guided": guided_way(plant, cell_file, cell, folder),
+        "step_by_step": step_by_step(plant, cell_file, cell, folder),
+    }
+
+
+def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[str, Any]:
+    """A guided session: its time, and the errors of its gains with their σ."""
+    numbers = iter(range(1, 1000))
+    begun_s = time.process_time()
+
+    def recorded(request: RecordingRequest, **further: Any) -> Recorded:
+        return plant.record(request, next(numbers), **further)
+
+    tools = Tools(
+        save_report=save_report,
+        drives=lambda _cell, _block, _take_over: None,  # no cell is on the bus between two recordings
+        plan=partial(plan, exchanges=EXCHANGES, largest_condition=NO_CONDITION, largest_std_percent=NO_STD_PERCENT),
+        record=recorded,
+        free=lambda _: 10**12,
+    )
+    payload = cell.payloads[0]
+    operator = GivenAnswers(
+        "the study", {payload.name: payload.mass_kg}, lambda _: None, "the study: a simulated cell", writes=False
+    )
+    settings = GuidedSettings(
+        folder / "sessions",
+        payload.name,
+        target_percent=TARGET_PERCENT,
+        block_s=BLOCK_S,
+        seed=100 * plant.seed,
+        min_free_mb=1.0,
+    )
+    journal = Journal(io.StringIO(), Form.TEXT, lambda: datetime.now(UTC))
+    ended = calibrate(cell_file, cell, settings, operator, tools, journal, lock_folder=folder)
+    assert ended.session is not None
+    calibration = calibration_of_session(ended.session)
+    assert calibration is not None
+    state = guided(ended.session)
+    mounted = [block.payload for block in state.blocks]
+    truth = plant.truth(cell)
+    errors = {gain.axis: 100.0 * (gain.value / truth[gain.axis] - 1.0) for gain in calibration.gains}
+    return {
+        "motion_s": BLOCK_S * len(state.blocks),
+        "changes": changes(mounted),
+        "blocks": len(state.blocks),
+        "missing": state.missing,
+        "error_percent": errors,
+        "std_percent": {gain.axis: gain.std_percent for gain in calibration.gains},
+        "effects": [effect.name for effect in calibration.effects],
+        "processor_s": time.process_time() - begun_s,
+    }
+
+
+def step_by_step(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[str, Any]:
+    """The shortest plan whose three runs give every gain within TRUE_ERROR_PERCENT of the truth."""
+    worst: dict[str, float] = {}
+    for duration_s in DURATIONS_S:
+        error = _worst_error(plant, cell_file, cell, folder / f"steps-{duration_s:g}", duration_s)
+        worst[f"{duration_s:g}"] = error
+        if error <= TRUE_ERROR_PERCENT:
+            return {"duration_s": duration_s, "worst_error_percent": worst}
+    return {"duration_s": None, "worst_error_percent": worst}
+
+
+def _worst_error(plant: Plant, cell_file: Path, cell: Cell, folder: Path, duration_s: float) -> float:
+    """The largest true error of a gain of three runs [%]; infinite where they do not give the gains."""
+    folder.mkdir()
+    first, second = (
+        plan(
+            cell,
+            seed=100 * plant.seed + 50 + number,
+            duration_s=duration_s,
+            exchanges=EXCHANGES,
+            largest_condition=NO_CONDITION,
+            largest_std_percent=NO_STD_PERCENT,
+        )
+        for number in (0, 1)
+    )
+    payload = cell.payloads[0]
+    logs = []
+    for name, mounted, moves in (("bare", None, first), ("loaded", payload, first), ("held-out", payload, second)):
+        logs.append(folder / f"{name}.mcap")
+        request = RecordingRequest(
+            cell_file,
+            cell,
+            moves,
+            logs[-1],
+            payload=None if mounted is None else mounted.payload,
+            operator="the study",
+            granted_by="the study: a simulated cell",
+            run_id=name,
+            entered_kg=None if mounted is None else mounted.mass_kg,
+        )
+        plant.record(request, 500 + round(duration_s) + len(logs))
+    try:
+        found = close_loop(fit(logs[:2], holdout=logs[2:]), 0, lambda _: None)
+    except IdentificationError:
+        return float("inf")
+    truth = np.array(list(plant.truth(cell).values()))
+    return float(np.max(np.abs(100.0 * (found.estimate.gains / truth - 1.0))))
+
+
+def changes(mounted: Sequence[str | None]) -> int:
+    """Number of changes of the payload; the session begins with an empty flange."""
+    before = [None, *mounted[:-1]]
+    return sum(one != other for one, other in zip(before, mounted, strict=True))
+
+
+def session_s(way: dict[str, Any]) -> float:
+    """Motion of a guided session with its changes [s]."""
+    return float(way["motion_s"] + CHANGE_S * way["changes"])
+
+
+def steps_s(way: dict[str, Any]) -> float:
+    """Motion of the three runs with their one change [s]; infinite where no duration was enough."""
+    duration_s = way["duration_s"]
+    return float("inf") if duration_s is None else 3.0 * float(duration_s) + CHANGE_S
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """A line for each robot, and the z of all gains."""
+    lines = [
+        "| robot | seeds | guided: motion s | changes | step by step: duration s | ratio of times, median | "
+        "target missed | error / σ, rms | worst error % |",
+        "|" + "---|" * 9,
+    ]
+    names = dict.fromkeys(row["robot"] for row in rows)
+    lines += [_line(name, [row for row in rows if row["robot"] == name]) for name in names]
+    if rows:
+        ratios = [session_s(row["guided"]) / steps_s(row["step_by_step"]) for row in rows]
+        lines.append(f"| all | {len(rows)} | | | | {np.median(ratios):.2f} | | {_rms_z(rows):.2f} | |")
+    return "\n".join(lines)
+
+
+def _line(name: str, own: Sequence[dict[str, Any]]) -> str:
+    guided_ways = [row["guided"] for row in own]
+    ratios = [session_s(row["guided"]) / steps_s(row["step_by_step"]) for row in own]
+    motion = np.median([way["motion_s"] for way in guided_ways])
+    changed = np.median([way["changes"] for way in guided_ways])
+    durations = [row["step_by_step"]["duration_s"] or np.inf for row in own]
+    missed = sum(bool(way["missing"]) for way in guided_ways)
+    worst = max(abs(error) for way in guided_ways for error in way["error_percent"].values())
+    times = f"{motion:.0f} | {changed:.0f} | {np.median(durations):.0f} | {np.median(ratios):.2f}"
+    return f"| {name} | {len(own)} | {times} | {missed} | {_rms_z(own):.2f} | {worst:.2f} |"
+
+
+def _rms_z(rows: Sequence[dict[str, Any]]) -> float:
+    z = [
+        error / row["guided"]["std_percent"][axis]
+        for row in rows
+        for axis, error in row["guided"]["error_percent"].items()
+    ]
+    return float(np.sqrt(np.mean(np.square(z))))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make what is missing, and print the table of what is there."""
+    names = [robot.name for robot in ROBOTS]
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.session_study", description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="ROBOT")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on")
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args(arguments)
+    source = digest_of_source("tests.studies.session_study")
+    units = [(robot, seed) for seed in options.seeds for robot in ROBOTS if robot.name in options.only]
+
+    def made(robot: StudiedRobot, seed: int) -> dict[str, Any]:
+        def make(folder: Path) -> dict[str, Any]:
+            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+                return study(robot, seed, folder)
+
+        return made_once(options.out, f"{robot.name}-{seed}", digest(source, robot.fingerprint, seed), make)
+
+    rows: list[dict[str, Any]] = []
+
+    def done(unit: tuple[StudiedRobot, int]) -> str:
+        row = made(*unit)
+        rows.append(row)
+        way = row["guided"]
+        return (
+            f"{row['robot']}-{row['seed']}: guided {way['motion_s']:.0f} s and {way['changes']} changes, "
+            f"step by step {row['step_by_step']['duration_s']}"
+        )
+
+    left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
+    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
