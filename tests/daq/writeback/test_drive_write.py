@@ -590,7 +590,7 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Pa
             if writes:
                 rollback(DriveTarget(cell, network), NOW)
             else:
-                with pytest.raises(CalibrationRefused, match="1 records of the present values"):
+                with pytest.raises(CalibrationRefused, match="1 record of the present values"):
                     rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES

@@ -83,7 +83,9 @@ def test_a_reversed_position_is_found(truth: Truth, clean: list[Run], axis: int,
     said = found.diagnosis(AXES)
     assert (said.name, said.axes) == (POSITION_REVERSED, (AXES[axis],))
     assert found.reversed_currents == ((axis,) if current_sign < 0.0 else ())
-    assert ("in the URDF, or the signs of both" in said.remedy) == (current_sign < 0.0)
+    # A current that counts the other way, too, asks for the axis in the URDF, or both signs in the cell file.
+    assert ("the <axis> of the joint" in said.remedy) == (current_sign < 0.0)
+    assert "`drive_train.ratio`" in said.remedy
     assert found.corrected_positions(np.ones((1, 3))).tolist() == [signs.tolist()]
 
 
