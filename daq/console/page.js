@@ -412,12 +412,12 @@ function drawn(tag, attributes, text) {
 }
 
 /** σ of each gain over the time of motion, both axes logarithmic: a fall as 1/√time is a straight line. */
-function drawPrecision(guided) {
-  const { progress, axes, target_percent: target } = guided;
+function drawPrecision(precision) {
+  const { progress, axes, target_percent: target, left_s: leftOver } = precision;
   const [width, height, left, right, top, bottom] = [640, 260, 48, 70, 12, 32];
   const times = progress.map((one) => one.motion_s);
   const values = [target, ...progress.flatMap((one) => one.std_percent)];
-  const [first, last] = [times[0], Math.max(times[0] * 2, times.at(-1) + (guided.left_s || 0))];
+  const [first, last] = [times[0], Math.max(times[0] * 2, times.at(-1) + leftOver)];
   const [low, high] = [Math.min(...values) / 1.3, Math.max(...values) * 1.3];
   const x = (time) => left + (width - left - right) * Math.log(time / first) / Math.log(last / first);
   const y = (value) => top + (height - top - bottom) * Math.log(high / value) / Math.log(high / low);
@@ -450,15 +450,16 @@ function showGuided(guided) {
   byId("stage").textContent = `Stage: ${guided.stage}. Recorded: ${guided.blocks.join(", ") || "nothing yet"}.`;
   byId("next-step").textContent = guided.next_step;
   const parts = [];
-  byId("precision").toggleAttribute("hidden", !guided.progress.length);
-  if (guided.progress.length) drawPrecision(guided);
+  const { precision, acceptance } = guided;
+  byId("precision").toggleAttribute("hidden", !precision);
+  if (precision) drawPrecision(precision);
   if (guided.missing) parts.push(element("p", `Not reached: ${guided.missing}`, "alarm"));
-  else if (guided.stage === "record" && guided.left_s) {
-    parts.push(element("p", `About ${Math.round(guided.left_s)} s of motion are left, if σ falls with the root of the time.`));
+  else if (guided.stage === "record" && precision && precision.left_s) {
+    parts.push(element("p", `About ${Math.round(precision.left_s)} s of motion are left, if σ falls with the root of the time.`));
   }
-  if (guided.acceptance) {
-    const verdict = guided.accepted ? "Accepted" : "Not accepted";
-    parts.push(element("p", `${verdict}: ${guided.acceptance}`, guided.accepted ? "" : "alarm"));
+  if (acceptance) {
+    const verdict = acceptance.accepted ? "Accepted" : "Not accepted";
+    parts.push(element("p", `${verdict}: ${acceptance.remark}`, acceptance.accepted ? "" : "alarm"));
   }
   byId("outlook").replaceChildren(...parts);
 }

@@ -148,20 +148,20 @@ class Results:
             return None
         state = newest.state
         position = position_of(state)
-        motion_s = state.progress[-1].motion_s if state.progress else 0.0
-        return {
+        found: dict[str, Any] = {
             "session": state.session,
             "stage": position.stage.value,
             "next_step": position.next_step,
             "blocks": [run.name for run in state.runs],
-            "axes": [gain.axis for gain in state.gains],
-            "target_percent": state.gains[0].target_percent if state.gains else None,
-            "progress": [{"motion_s": one.motion_s, "std_percent": list(one.std_percent)} for one in state.progress],
-            "left_s": left_s(state.gains, motion_s) if state.gains else None,
             "missing": state.missing,
-            "acceptance": None if state.acceptance is None else state.acceptance.remark,
-            "accepted": None if state.acceptance is None else state.acceptance.accepted,
+            "precision": None,
+            "acceptance": None,
         }
+        if state.progress and state.gains:
+            found["precision"] = _precision(state)
+        if state.acceptance is not None:
+            found["acceptance"] = {"accepted": state.acceptance.accepted, "remark": state.acceptance.remark}
+        return found
 
     def _session(self) -> dict[str, Any] | None:
         newest = self._newest()
@@ -182,3 +182,13 @@ class Results:
             "sentences": [] if state.fitted is None else list(state.fitted.sentences),
             "to_do": [] if ended is None else to_do(ended, self._cell_file),
         }
+
+
+def _precision(state: GuidedState) -> dict[str, Any]:
+    """Return σ of each gain after each judged block, its target, and the motion that is left."""
+    return {
+        "axes": [gain.axis for gain in state.gains],
+        "target_percent": state.gains[0].target_percent,
+        "progress": [one.model_dump(mode="json") for one in state.progress],
+        "left_s": left_s(state.gains, state.progress[-1].motion_s),
+    }

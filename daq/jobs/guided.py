@@ -309,9 +309,10 @@ def require_same_cell(context: SessionContext) -> None:
 
 
 def left_s(gains: Sequence[GainSoFar], motion_s: float) -> float:
-    """Return the motion that is left until every gain is at its target, if σ falls as 1/√time [s]."""
+    """Return the motion that is left until every gain is at its target, if σ falls as 1/√time [s]; 0 without gains."""
     ratios = [gain.std_percent / gain.target_percent for gain in gains]
-    return max(0.0, motion_s * (max(ratios) ** 2 - 1.0))
+    worst = max(ratios, default=0.0)
+    return max(0.0, motion_s * (worst**2 - 1.0))
 
 
 def gains_so_far(context: SessionContext, estimate: Estimate, target_percent: float) -> tuple[GainSoFar, ...]:

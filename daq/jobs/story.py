@@ -38,7 +38,10 @@ class Story(Journal):
 
 def _text(level: Level, event: str, fields: Fields) -> str:
     """Return what a person reads of an event; empty for one that tells nothing."""
-    tell = SENTENCES.get(event)
+    template = SENTENCES.get(event)
+    if template is not None:
+        return template.format_map(fields)
+    tell = PARAGRAPHS.get(event)
     if tell is not None:
         return tell(fields)
     if level > Level.WARNING:
@@ -69,73 +72,48 @@ def _gains(fields: Fields) -> str:
     return "\n".join(lines)
 
 
-def _begun(fields: Fields) -> str:
-    return f"A new session begins. Its files are in {fields['folder']}."
-
-
-def _taken_up(fields: Fields) -> str:
-    return f"The session goes on where it was. Recorded already: {fields['recorded']}."
-
-
-def _not_taken_up(fields: Fields) -> str:
-    return f"! The unfinished session in {fields['folder']} is left as it is: {fields['reason']}."
-
-
-def _compared(fields: Fields) -> str:
-    return f"\nBeside the gains in the controller: {fields['words']}."
-
-
 def _recorded(fields: Fields) -> str:
     lost = fields["lost_cycles"]
     return f"Recorded {fields['samples']} samples, {lost or 'none'} lost."
 
 
-def _invalid(fields: Fields) -> str:
-    return f"! This recording cannot be used ({fields['reason']}); it is kept, and the block is recorded again."
-
-
-def _weighed(fields: Fields) -> str:
-    return f"The moves show about {fields['added_kg']:.2g} kg more on the flange than without load."
-
-
 def _identifying(fields: Fields) -> str:
-    logs = len(fields["logs"])
+    count = len(fields["logs"])
     held_out = ", ".join(name.removesuffix(".mcap") for name in fields["holdout"])
-    return f"\nIdentifying all gains from {logs} blocks; {held_out} is held out, to judge the model."
+    return f"\nIdentifying all gains from {count} blocks; {held_out} is held out, to judge the model."
 
 
-def _written(fields: Fields) -> str:
-    return f"Written to {fields['file']}. The content before is in {fields['backup']}."
-
-
-SENTENCES: dict[str, Callable[[Fields], str]] = {
-    "session begun": _begun,
-    "session taken up": _taken_up,
-    "an unfinished session is not taken up": _not_taken_up,
-    "the interlock lets the robot move": lambda fields: "Checked: disk, history and interlock.",
-    "drives are as declared, without fault and without power": lambda fields: "Checked: the drives.",
-    "moves to look at": lambda fields: f"\nThe moves of {fields['run']}, to look at first: {fields['page']}",
-    "rehearsing": lambda fields: f"Rehearsing at {100.0 * fields['speed']:.0f} % of the speed; nothing is logged.",
+PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
     "recorded": _recorded,
-    "recording is invalid": _invalid,
-    "set aside": lambda fields: f"The earlier recording is kept as {fields['log']}.",
-    "warning of the recorder": lambda fields: f"! {fields['text']}",
-    "weighed": _weighed,
-    "mistake in a block": lambda fields: f"\n! {fields['text']}",
-    "kept as it is": lambda fields: f"{fields['block']} is kept as it is.",
     "gains so far": _gains,
-    "the blocks so far do not give the gains": lambda fields: f"\n! The blocks so far give no gains: {fields['text']}",
-    "diagnosis": lambda fields: f"! {fields['text']}",
     "identifying": _identifying,
-    "found": lambda fields: f"  {fields['text']}",
-    "certificate": lambda fields: f"Certificate: {fields['page']}",
-    "drift": lambda fields: f"! {fields['axis']}: {fields['text']}",
-    "compared with the gains in the controller": _compared,
-    "a check failed": lambda fields: f"✗ {fields['text']}",
-    "written to the controller's file": _written,
-    "proposed: an operator has to apply it": lambda fields: "Nothing was written.",
-    "session ended": lambda _: "",  # the summary or the error follows
-    "accepted": lambda fields: f"✓ Accepted: {fields['text']}.",
-    "not accepted": lambda fields: f"✗ Not accepted: {fields['text']}.",
 }
-"""What a person reads of an event, by its words in the journal."""
+"""What a person reads of an event where that is more than a sentence with its fields."""
+
+SENTENCES = {
+    "session begun": "A new session begins. Its files are in {folder}.",
+    "session taken up": "The session goes on where it was. Recorded already: {recorded}.",
+    "an unfinished session is not taken up": "! The unfinished session in {folder} is left as it is: {reason}.",
+    "the interlock lets the robot move": "Checked: disk, history and interlock.",
+    "drives are as declared, without fault and without power": "Checked: the drives.",
+    "moves to look at": "\nThe moves of {run}, to look at first: {page}",
+    "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
+    "recording is invalid": "! This recording cannot be used ({reason}); it is kept, and the block is recorded again.",
+    "set aside": "The earlier recording is kept as {log}.",
+    "warning of the recorder": "! {text}",
+    "weighed": "The moves show about {added_kg:.2g} kg more on the flange than without load.",
+    "mistake in a block": "\n! {text}",
+    "kept as it is": "{block} is kept as it is.",
+    "the blocks so far do not give the gains": "\n! The blocks so far give no gains: {text}",
+    "found": "  {text}",
+    "certificate": "Certificate: {page}",
+    "drift": "! {axis}: {text}",
+    "compared with the gains in the controller": "\nBeside the gains in the controller: {words}.",
+    "a check failed": "✗ {text}",
+    "written to the controller's file": "Written to {file}. The content before is in {backup}.",
+    "proposed: an operator has to apply it": "Nothing was written.",
+    "session ended": "",  # the end of the session or the error follows
+    "accepted": "✓ Accepted: {text}.",
+    "not accepted": "✗ Not accepted: {text}.",
+}
+"""The sentence of each event, with its fields."""

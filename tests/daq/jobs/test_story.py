@@ -23,7 +23,7 @@ from daq.jobs.guided import left_s
 from daq.jobs.journal import Form, Level
 from daq.jobs.position import StageName, position_of
 from daq.jobs.session import Session, save
-from daq.jobs.story import SENTENCES, Story
+from daq.jobs.story import PARAGRAPHS, SENTENCES, Story
 from tests.daq.jobs.made_session import MadeSession, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, Rig
 
@@ -78,7 +78,8 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     assert "Accepted" in text
     assert "kg more on the flange than without load" in text
     assert "2026-" not in "".join(line for line in text.splitlines() if "/" not in line)
-    assert {event["event"] for event in rig.events} & set(SENTENCES)
+    assert set(PARAGRAPHS) <= {event["event"] for event in rig.events}
+    assert not set(PARAGRAPHS) & set(SENTENCES)
 
 
 def state(**changed: object) -> GuidedState:
@@ -142,11 +143,12 @@ def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(
     shown = results.document()
     assert shown["problems"] == []
     assert shown["guided"]["stage"] == "ended"
-    assert shown["guided"]["accepted"] is True
-    assert shown["guided"]["left_s"] == 0.0
-    (progress,) = shown["guided"]["progress"]
+    assert shown["guided"]["acceptance"]["accepted"] is True
+    precision = shown["guided"]["precision"]
+    assert precision["left_s"] == 0.0
+    (progress,) = precision["progress"]
     assert progress["motion_s"] == 18.0
-    assert len(progress["std_percent"]) == len(shown["guided"]["axes"]) == 6
+    assert len(progress["std_percent"]) == len(precision["axes"]) == 6
     assert shown["session"]["kind"] == "Session"
     waiting = state(runs=(_run("block-1-bare"),))
     folder = rig.session.folder
