@@ -155,7 +155,7 @@ def ask(question: str) -> str:
     """Ask the operator; return the answer without spaces.
 
     Raises:
-        JobHeld: nobody answers.
+        JobHeld: the input has ended.
     """
     typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
     answer = sys.stdin.readline()
@@ -245,10 +245,12 @@ def calibrate_verb(options: CalibrateOptions) -> None:
 
     declared = read_cell(options.cell)
     _check_yes_move(declared, options.yes_move)
-    payload = payload_for_blocks(declared, options.payload)
+    payload_name = options.payload or ""
+    if not options.check:  # whose table says what is wrong with it
+        payload_name = payload_for_blocks(declared, options.payload).name
     settings = GuidedSettings(
         options.sessions or sessions_folder(options.cell),
-        payload.name,
+        payload_name,
         target_percent=options.target or declared.target_sigma_percent,
         block_s=options.block,
         time_limit_min=options.time_limit,

@@ -53,15 +53,15 @@ def format_of(name: str) -> ControllerFormat:
     return ControllerFormat.YAML
 
 
-def comment_behind(rest: str, name: str, format: ControllerFormat | None = None) -> str:  # noqa: A002
+def comment_behind(rest: str, name: str, file_format: ControllerFormat | None = None) -> str:
     """Return the comment behind a number on its line, empty where there is none.
 
     Args:
         rest: text of the file behind the number.
         name: of the file.
-        format: of the file; None where its name says it.
+        file_format: of the file; None where its name says it.
     """
-    pattern = _COMMENTS.get(format or format_of(name))
+    pattern = _COMMENTS.get(file_format or format_of(name))
     if pattern is None:
         return ""
     found = pattern.match(rest)

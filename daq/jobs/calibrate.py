@@ -94,14 +94,7 @@ def _resumed_or_new(context: SessionContext) -> Session:
     attempt = session.state.attempt + 1
     blocks = [run.name for run in session.state.runs]
     context.journal.say(Level.NOTICE, "session taken up", attempt=attempt, recorded=", ".join(blocks) or "nothing")
-    return session.update(
-        attempt=attempt,
-        attempt_began=now.isoformat(timespec="seconds"),
-        outcome=None,
-        exit_code=None,
-        problem="",
-        ended=None,
-    )
+    return sessions.resume(session, now)
 
 
 def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datetime) -> None:
@@ -154,14 +147,14 @@ def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:
     for payload in cell.payloads:
         if payload.name == name:
             return payload
-    raise ConfigurationInconsistent(
-        f"payload of cell {cell.name!r}",
-        found="none named" if name is None else repr(name),
-        expected=f"one of {', '.join(names)}"
-        if names
-        else "at least one in `payloads`: its mass is the scale of all gains",
-        remedy="name it with its mass, as in docs/how-to/plan-moves.md" if not names else "name one of them",
-    )
+    found = "none named" if name is None else repr(name)
+    if names:
+        expected = f"one of {', '.join(names)}"
+        remedy = "name one of them with --payload"
+    else:
+        expected = "at least one in `payloads`: its mass is the scale of all gains"
+        remedy = "add it to the cell file with its mass"
+    raise ConfigurationInconsistent(f"payload of cell {cell.name!r}", found=found, expected=expected, remedy=remedy)
 
 
 def _payload_text(cell: Cell, name: str | None) -> str:

@@ -157,14 +157,7 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
         return session
     attempt = session.state.attempt + 1
     replace(journal, session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
-    return session.update(
-        attempt=attempt,
-        attempt_began=now.isoformat(timespec="seconds"),
-        outcome=None,
-        exit_code=None,
-        problem="",
-        ended=None,
-    )
+    return sessions.resume(session, now)
 
 
 AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason

@@ -46,7 +46,7 @@ class Operator(Protocol):
         """Return who permits the motion of a run, in words for its log.
 
         Raises:
-            MotionRefused: nobody does.
+            MotionRefused: motion is not permitted.
         """
 
     def record_again(self, run: PlannedRun, mistake: str) -> bool:

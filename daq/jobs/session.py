@@ -157,6 +157,22 @@ def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, w
     return last if young and its == basis else None
 
 
+def resume(session: Session, now: datetime) -> Session:
+    """Begin another attempt of an unfinished session: how the one before ended is forgotten.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    return session.update(
+        attempt=session.state.attempt + 1,
+        attempt_began=now.isoformat(timespec="seconds"),
+        outcome=None,
+        exit_code=None,
+        problem="",
+        ended=None,
+    )
+
+
 def last_good(found: tuple[Session, ...]) -> Session | None:
     """Newest session with a valid calibration."""
     for session in reversed(found):

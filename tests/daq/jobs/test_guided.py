@@ -757,3 +757,16 @@ def test_check_says_what_is_there_and_what_a_first_session_can_show(
     assert "✗ disk, interlock, drives" in said
     assert "close the cell" in said
     assert rig.sessions == ()
+
+
+def test_check_of_a_payload_that_the_cell_lacks_is_a_line_of_the_table(
+    tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session, min_free_mb=1)
+    arguments = ["calibrate", str(rig.cell_file), "--check", "--block", "8", "--payload", "anvil"]
+    with serving(rig):
+        assert main(arguments) == ExitCode.CONFIGURATION
+    said = capsys.readouterr().out
+    assert "✗ payload" in said
+    assert "'anvil'" in said
+    assert said.count("✓") == 3

@@ -111,7 +111,7 @@ def test_a_command_is_not_broken() -> None:
 def test_every_line_of_a_verb_is_broken_between_words_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of `say`, of the views and of errors; a pipe gets whole lines."""
+    """`say`, views and errors break lines alike; a pipe gets whole lines."""
     sentence = "averages of the exchanges " * 8
     failure = ErrorParts("DataError", sentence, sentence, sentence, sentence, 4)
     for is_terminal in (True, False):
