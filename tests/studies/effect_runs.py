@@ -18,6 +18,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording
+from drivers.simulation.spec import CellSpec
 from ident.data.run import Run
 from tests.studies.direct_cell import MOVING, RawRun, run_of, simulate_run
 from tests.studies.effect_cells import EffectCase
@@ -89,21 +90,32 @@ class CaseTask:
         return tuple(PlanTask(self.out, first + letter, self.duration_s) for letter in range(PLANS_A_SET))
 
 
-def make_case(task: CaseTask) -> float:
-    """Simulate the runs of a case unless the same ones are there; return the processor time that it took [s]."""
-    begun_s = time.process_time()
+def specs_of(task: CaseTask) -> list[CellSpec]:
+    """The plant of each run."""
+    return [task.case.spec(task.world, payload, number) for number, (_, payload, _) in enumerate(RUNS)]
+
+
+def fingerprint_of_runs(task: CaseTask) -> str:
+    """What the runs of a case depend on; its plans were made."""
     cell = load_cell(CELL)
     plans = [kept_plan(made, cell) for made in task.plans]
-    specs = [task.case.spec(task.world, payload, number) for number, (_, payload, _) in enumerate(RUNS)]
-    fingerprint = digest(
+    return digest(
         digest_of_source("tests.studies.direct_cell", MOVING),
         cell.digest,
         task.case,
         [made.moves for made in plans],
-        [(spec.urdf, spec.axes, spec.payload) for spec in specs],
+        [(spec.urdf, spec.axes, spec.payload) for spec in specs_of(task)],
     )
+
+
+def make_case(task: CaseTask) -> float:
+    """Simulate the runs of a case unless the same ones are there; return the processor time that it took [s]."""
+    begun_s = time.process_time()
+    fingerprint = fingerprint_of_runs(task)
     if is_finished(task.path, fingerprint):
         return 0.0
+    cell = load_cell(CELL)
+    plans = [kept_plan(made, cell) for made in task.plans]
     raw = [
         simulate_run(
             cell,
@@ -113,7 +125,7 @@ def make_case(task: CaseTask) -> float:
             None if payload is None else declared_payload(payload),
             number * (task.duration_s + PAUSE_S),
         )
-        for number, (spec, (name, payload, letter)) in enumerate(zip(specs, RUNS, strict=True))
+        for number, (spec, (name, payload, letter)) in enumerate(zip(specs_of(task), RUNS, strict=True))
     ]
     task.path.parent.mkdir(parents=True, exist_ok=True)
     write_runs(task.path, raw)

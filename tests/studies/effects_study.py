@@ -37,8 +37,8 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
-from tests.studies.effect_runs import DURATION_S, CaseTask, load_runs, make_case
-from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, mark_of
+from tests.studies.effect_runs import DURATION_S, CaseTask, fingerprint_of_runs, load_runs, make_case
+from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.output import as_csv
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS, world_cell
@@ -210,15 +210,14 @@ def with_floors(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 def _work(task: _Task) -> tuple[str, ...]:
     """Simulate and search one case as far as that was not done."""
-    simulation_s = make_case(task.runs)
     searching = digest_of_source("ident.discovery.loop"), digest_of_source("daq.log.importing")
-    lines = []
-    for part in task.parts:
+    fingerprint = digest(*searching, f"{fingerprint_of_runs(task.runs)}\n")
+    lacking = [part for part in task.parts if not is_finished(task.path(part), fingerprint)]
+    lines = [f"{part} {task.runs.case.name}, {task.runs.world}: kept" for part in task.parts if part not in lacking]
+    # A row that was carried here from another machine (kept_rows.py) needs no recordings.
+    simulation_s = make_case(task.runs) if lacking else 0.0
+    for part in lacking:
         path = task.path(part)
-        fingerprint = digest(*searching, mark_of(task.runs.path).read_text())
-        if is_finished(path, fingerprint):
-            lines.append(f"{part} {task.runs.case.name}, {task.runs.world}: kept")
-            continue
         row = _search(task.runs, part, simulation_s)
         replace_file(path, json.dumps(asdict(row)).encode())
         finish(path, fingerprint)

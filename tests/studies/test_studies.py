@@ -30,8 +30,9 @@ from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
 from tests.studies.blind_cells import FAMILIES, NOTHING, blind_cases, confusion
 from tests.studies.chain_effects import PLANTED, PlantedEffect
 from tests.studies.direct_cell import RawRun, demand_rad, run_of
-from tests.studies.fingerprint import made_once
+from tests.studies.fingerprint import finish, is_finished, made_once
 from tests.studies.followed_cell import follow, without_rest
+from tests.studies.kept_rows import pack, unpack
 from tests.studies.planted_mistakes import Mistake, Planted, judge_mistake, plant, tilted
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.regions import PARTS, independent_sums, judge_rise, region_of, split_by_region, two_sides
@@ -40,6 +41,7 @@ from tests.studies.side_by_side import Shard
 from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
 from tests.studies.study_rows import finished_rows, from_csv, rows_of_unit, to_csv, work_off
+from tests.studies.warm_up_study import BARE_THEN_LOADED, BLOCK_S, CHANGE_S, GUIDED, PAUSE_S, start_times_s
 
 
 @settings(max_examples=25)
@@ -248,6 +250,34 @@ def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Pa
     units = [unit, NamedUnit("another")]
     assert finished_rows(tmp_path, units, SomeRow, lambda _: "b") == rows
     assert finished_rows(tmp_path, units, SomeRow, lambda _: "a") == ()
+
+
+def test_rows_carried_to_another_machine_are_finished_there_for_the_same_code_alone(tmp_path: Path) -> None:
+    made = tmp_path / "made" / "loop8" / "clean-00.json"
+    made.parent.mkdir(parents=True)
+    made.write_text('{"case": "clean-00"}')
+    finish(made, "of this code")
+    (made.parent / "unfinished.json").write_text("{}")
+    packed = tmp_path / "data" / "rows.jsonl"
+
+    assert pack(tmp_path / "made", packed) == 1
+    assert unpack(packed, tmp_path / "other") == 1
+
+    carried = tmp_path / "other" / "loop8" / "clean-00.json"
+    assert carried.read_text() == made.read_text()
+    assert is_finished(carried, "of this code")
+    assert not is_finished(carried, "of code that has changed")
+    assert unpack(packed, tmp_path / "other") == 0  # what is there stays
+
+
+def test_blocks_of_a_guided_session_begin_after_each_change_of_the_payload() -> None:
+    bare_s, loaded_s, held_out_s, *_ = start_times_s(GUIDED)
+
+    assert bare_s == 0.0
+    assert loaded_s == BLOCK_S + PAUSE_S + CHANGE_S
+    assert held_out_s == loaded_s + BLOCK_S + PAUSE_S
+    assert start_times_s(GUIDED)[-1] == 6 * (BLOCK_S + PAUSE_S) + 3 * CHANGE_S
+    assert start_times_s(BARE_THEN_LOADED)[-1] == 6 * (BLOCK_S + PAUSE_S) + CHANGE_S
 
 
 def test_no_unit_is_begun_after_its_minutes() -> None:

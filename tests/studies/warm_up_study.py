@@ -1,0 +1,231 @@
+"""How far friction that falls while the arm warms up bends the gains, by the order of bare and loaded blocks.
+
+    python -m tests.studies.warm_up_study --seeds 1 2 3
+    python -m tests.studies.warm_up_study --shard 1/2 --minutes 30      goes on where it ended
+
+Each cell is simulated twice with the same noise, moves and times: with friction that falls on all axes, and with
+friction that stays. The difference of the gains is what the warm-up does. *Bare, then loaded* is how it is done step by
+step. *Guided* is the order of a guided session that went on to its seventh block (`daq.jobs.guided`). Both have three
+bare and three loaded blocks in the fit. Layout: out/warm-up-study/<cell>.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell, model_of
+from daq.config.cell_file import load_cell
+from daq.files import replace_file
+from daq.jobs.guided import FIRST_BLOCKS, NEXT_BLOCKS, BlockRole
+from drivers.simulation.spec import UndeclaredEffect
+from ident.arrays import FloatArray
+from ident.data.run import Run
+from ident.discovery.evidence import gather
+from ident.discovery.loop import find_effects
+from ident.estimators.identify import identify
+from tests.studies.direct_cell import MOVING, run_of, simulate_run
+from tests.studies.fingerprint import digest, digest_of_source
+from tests.studies.output import print_line
+from tests.studies.side_by_side import Shard, shard
+from tests.studies.study_cells import StudyCell, declared_payload, spec_of, world_cell
+from tests.studies.study_plans import CELL, PlanTask, kept_plan, make_plan
+from tests.studies.study_rows import finished_rows, rows_of_unit, to_csv, work_off
+
+OUT = Path("out/warm-up-study")
+WORLD = "measurement"
+PAYLOAD = "disc"
+SEEDS = (1, 2, 3)
+TIME_CONSTANTS_MIN = (2.0, 5.0, 10.0, 30.0)
+COLD_FRACTION = 0.3  #: Friction of the cold arm over that of the warm one
+BLOCK_S = 20.0
+PAUSE_S = 15.0  #: Between two blocks
+CHANGE_S = 180.0  #: Where the payload is changed between them
+FIRST_PLAN = 5001
+"""Moves of this study are none of another study's."""
+BARE_THEN_LOADED = (BlockRole.BARE,) * 3 + (BlockRole.LOADED,) * 3 + (BlockRole.HELD_OUT,)
+GUIDED = (*FIRST_BLOCKS, *NEXT_BLOCKS)
+ORDERS = {"bare, then loaded": BARE_THEN_LOADED, "guided": GUIDED}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a warm-up does to the gains of one cell in one order."""
+
+    seed: int
+    time_constant_min: float
+    order: str
+    bent_percent: float  #: largest change of a gain by the warm-up, of the fit without a search
+    searched_bent_percent: float  #: the same after the search, whose dictionary has such a friction
+    named: tuple[str, ...]  #: what the search found in the cell that warms up
+    std_percent: float  #: σ of the worst gain after the search
+
+
+@dataclass(frozen=True, slots=True)
+class WarmingCell:
+    """A cell, and how fast its friction falls."""
+
+    seed: int
+    time_constant_min: float
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.seed}-{self.time_constant_min:g}min"
+
+
+def start_times_s(roles: Sequence[BlockRole]) -> tuple[float, ...]:
+    """When each block begins [s], from the start of the session with an empty flange."""
+    times: list[float] = []
+    now_s = 0.0
+    carried = False
+    for role in roles:
+        is_loaded = role is not BlockRole.BARE
+        if is_loaded != carried:
+            now_s += CHANGE_S
+        carried = is_loaded
+        times.append(now_s)
+        now_s += BLOCK_S + PAUSE_S
+    return tuple(times)
+
+
+def simulated(drawn: StudyCell, cell: Cell, roles: Sequence[BlockRole], minutes: float | None) -> list[Run]:
+    """The blocks of a session; friction falls with a time constant of so many minutes, or stays for None."""
+    runs = []
+    for number, (role, began_s) in enumerate(zip(roles, start_times_s(roles), strict=True)):
+        is_loaded = role is not BlockRole.BARE
+        spec = spec_of(drawn, PAYLOAD if is_loaded else None, number)
+        if minutes is not None:
+            spec = replace(spec, effects=tuple(warm_up(axis, minutes) for axis in range(len(spec.axes))))
+        plan = kept_plan(_plan_task(number), cell)
+        payload = declared_payload(PAYLOAD) if is_loaded else None
+        raw = simulate_run(cell, spec, plan, f"block-{number + 1}", payload, began_s)
+        runs.append(run_of(raw, cell))
+    return runs
+
+
+def warm_up(axis: int, minutes: float) -> UndeclaredEffect:
+    """Friction of an axis that falls with a time constant of so many minutes."""
+    parameters = {"cold_fraction": COLD_FRACTION, "time_constant_s": 60.0 * minutes}
+    return UndeclaredEffect("warm-up", axis, parameters)
+
+
+def study(unit: WarmingCell) -> tuple[Row, ...]:
+    """Both orders of one cell."""
+    cell = load_cell(CELL)
+    drawn = world_cell(unit.seed, WORLD)
+    rows = []
+    for order, roles in ORDERS.items():
+        steady = _gains(cell, simulated(drawn, cell, roles, None), roles)
+        warming = _gains(cell, simulated(drawn, cell, roles, unit.time_constant_min), roles)
+        row = Row(
+            seed=unit.seed,
+            time_constant_min=unit.time_constant_min,
+            order=order,
+            bent_percent=_largest_change(steady.fitted, warming.fitted),
+            searched_bent_percent=_largest_change(steady.searched, warming.searched),
+            named=warming.named,
+            std_percent=warming.std_percent,
+        )
+        rows.append(row)
+    return tuple(rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gains:
+    fitted: FloatArray  #: without a search, shape (n,)
+    searched: FloatArray  #: after it, shape (n,)
+    named: tuple[str, ...]
+    std_percent: float
+
+
+def _gains(cell: Cell, runs: Sequence[Run], roles: Sequence[BlockRole]) -> _Gains:
+    fit_runs = [run for run, role in zip(runs, roles, strict=True) if role is not BlockRole.HELD_OUT]
+    unseen = [run for run, role in zip(runs, roles, strict=True) if role is BlockRole.HELD_OUT]
+    found = identify(model_of(cell), fit_runs, cell.conditioning)
+    end = find_effects(gather(found, fit_runs, unseen), np.random.default_rng(0))[-1].after
+    estimate = end.estimate
+    return _Gains(
+        fitted=found.estimate.gains,
+        searched=estimate.gains,
+        named=tuple(f"{placed.effect.name} on J{placed.axis + 1}" for placed in end.effects),
+        std_percent=float(100.0 * np.max(estimate.gains_std / np.abs(estimate.gains))),
+    )
+
+
+def _largest_change(steady: FloatArray, warming: FloatArray) -> float:
+    return float(100.0 * np.max(np.abs(warming / steady - 1.0)))
+
+
+def _plan_task(number: int) -> PlanTask:
+    return PlanTask(OUT, FIRST_PLAN + number, BLOCK_S)
+
+
+def fingerprint_of(unit: WarmingCell) -> str:
+    """What the rows of a cell depend on."""
+    return digest(
+        digest_of_source("tests.studies.direct_cell", MOVING),
+        digest_of_source("ident.discovery.loop"),
+        ORDERS,
+        (COLD_FRACTION, BLOCK_S, PAUSE_S, CHANGE_S),
+        unit,
+    )
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """A line for each time constant: the means over the cells, and their ratio."""
+    lines = [
+        "| time constant, min | cells | bare, then loaded: bent by % | guided: bent by % | ratio | "
+        "after the search: bent by % | guided | ratio |",
+        "|" + "---|" * 8,
+    ]
+    constants_min = sorted({row.time_constant_min for row in rows})
+    lines += [_line(f"{one:g}", [row for row in rows if row.time_constant_min == one]) for one in constants_min]
+    if rows:
+        lines.append(_line("all", rows))
+    return "\n".join(lines)
+
+
+def _line(name: str, rows: Sequence[Row]) -> str:
+    before = [row for row in rows if row.order != "guided"]
+    guided = [row for row in rows if row.order == "guided"]
+    cells = len(guided)
+    plain, plain_guided = (float(np.mean([row.bent_percent for row in part])) for part in (before, guided))
+    found, found_guided = (float(np.mean([row.searched_bent_percent for row in part])) for part in (before, guided))
+    return (
+        f"| {name} | {cells} | {plain:.2f} | {plain_guided:.2f} | {plain_guided / plain:.2f} | "
+        f"{found:.2f} | {found_guided:.2f} | {found_guided / found:.2f} |"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make what is missing, and print the table of what is there."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.warm_up_study", description=__doc__)
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no cell is begun")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args(arguments)
+    units = [WarmingCell(seed, minutes) for seed in options.seeds for minutes in TIME_CONSTANTS_MIN]
+    for number in range(len(GUIDED)):
+        print_line(make_plan(_plan_task(number)))
+
+    def done(unit: WarmingCell) -> str:
+        rows = rows_of_unit(options.out, unit, Row, fingerprint_of(unit), study)
+        return "; ".join(f"{unit.name}, {row.order}: bent by {row.bent_percent:.2f} %" for row in rows)
+
+    left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
+    rows = finished_rows(options.out, units, Row, fingerprint_of)
+    replace_file(options.out / "warm-up.csv", to_csv(Row, rows).encode())
+    print_line(f"\n{left} cells of this piece were not begun\n\n{summary(rows)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
