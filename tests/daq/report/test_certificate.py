@@ -205,6 +205,17 @@ def test_the_verdict_is_that_of_the_gates() -> None:
     assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
 
 
+def test_without_a_controller_no_message_names_a_current_gain() -> None:
+    calibration = demo_calibration()
+    first = calibration.gains[0]
+    reversed_gain = replace(first, value=-first.value)
+    reversed_first = replace(calibration, gains=(reversed_gain, *calibration.gains[1:]))
+    certificate = certify(reversed_first, without_controller(reversed_first, "", NOW))
+    (sign,) = (one for one in certificate.comparison.refusals if one.gate is Gate.SIGN)
+    assert sign.found == "gain -33.9, nameplate 32.96"
+    assert "current gain" not in certificate_page(certificate)
+
+
 def test_gains_that_were_held_are_the_first_reason() -> None:
     calibration = demo_calibration()
     held = replace(calibration, gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains))
@@ -239,10 +250,10 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
     assert [axis["key"] for axis in document["axes"]] == [f"drives.J{number}.gain" for number in range(1, 7)]
-    # J4 went from -11.52 to -9.21: its size decreased. The number in the controller is no calibration's.
+    # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
     assert document["axes"][3]["change_sigmas"] < 0.0 < document["axes"][0]["change_sigmas"]
     texts = Reader(page.read_text(encoding="utf-8")).texts
-    taken = "the number in the controller taken as exact (all axes)."
+    taken = "with the current gain taken as exact (all axes)."
     assert f"More than noise: probability below 1 % among all axes, {taken}" in texts
     # Of gains that must not be written the page does not show what would be.
     assert not {axis["written"] for axis in document["axes"]} & set(texts)
@@ -250,7 +261,7 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     assert main(["certificate", str(file), "--json"]) == ExitCode.OK
     unread = json.loads(capsys.readouterr().out)["axes"]
     assert all(axis["key"] is axis["line"] is None for axis in unread)
-    assert "the nameplate taken as exact (all axes)." in page.read_text(encoding="utf-8")
+    assert "with the nameplate taken as exact (all axes)." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
     assert main(["certificate", str(file)]) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"

@@ -138,7 +138,7 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
         proposal = _propose(cell, network)
     assert listener.downloads() == []
     assert list(tmp_path.iterdir()) == []
-    assert [change.old for change in proposal.edit.changes] == IN_DRIVES
+    assert [change.current_gain for change in proposal.edit.changes] == IN_DRIVES
     assert [change.new for change in proposal.edit.changes] == NEW
     assert proposal.edit.changes[3].key == "J4, 2003h:01"
     assert proposal.edit.before != proposal.edit.after
