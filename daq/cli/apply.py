@@ -69,7 +69,7 @@ class ApplyOptions:
     ] = None
     max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None
     max_nameplate_percent: Annotated[
-        float | None, typer.Option(help="Tighter bound on the distance from the nameplate [%].", min=0.0)
+        float | None, typer.Option(help="Tighter bound on the change from the nameplate [%].", min=0.0)
     ] = None
     max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None
     configuration_changed: Annotated[

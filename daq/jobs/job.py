@@ -106,7 +106,7 @@ def preview(
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
         steps += ["fit and close the loop"]
-    steps += ["compare with the controller's gains", f"apply by {cell.apply.by.value}", "report"]
+    steps += ["compare with the current gains", f"apply by {cell.apply.by.value}", "report"]
     taken = "a new session" if session is None else f"session {session.state.session} is taken up"
     return Preview(tuple(steps), taken)
 

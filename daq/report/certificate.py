@@ -199,12 +199,12 @@ class Certificate:
         """The verdict in one sentence; of gains that are in force, who has written them."""
         differing = [row for row in self.shown if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
-        furthest = "" if most is None else f"{most.change.axis} by {most.change.change_percent:+.1f} %"
+        furthest = "" if most is None else f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
         total = len(self.shown)
         count = f"all {total} gains" if len(differing) == total else f"{len(differing)} of {total} gains"
         write = self.comparison.in_force
         if write is not None:
-            return self._written_sentence(write, f"{count} changed by more than noise, most {furthest}")
+            return self._written_sentence(write, f"{count} changed by more than noise, {furthest}")
         match self.verdict:
             case Verdict.REFUSED:
                 return f"Must not be written: {self._reason}."
@@ -212,10 +212,10 @@ class Certificate:
                 return "Nothing to change: no gain differs from the current gain by more than noise."
             case Verdict.WAITING:
                 remedy = self.comparison.refusals[0].remedy
-                return f"Waits for an operator: {count} change, most {furthest}; {remedy}."
+                return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
-                return f"Ready to be written: {count} change by more than noise, most {furthest}; every check passed."
-        differ = f"{count} differ from the nameplate by more than noise, most {furthest}"
+                return f"Ready to be written: {count} change by more than noise, {furthest}. Every check passed."
+        differ = f"{count} differ from the nameplate by more than noise, {furthest}"
         return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
 
     @property

@@ -426,7 +426,7 @@ def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
         put = [rewrite_gain(numbers[gain.axis][0], gain.value, gain.std, numbers[gain.axis][1]) for gain in entry.gains]
     except ControllerUnfit:
         return False
-    return all(one.new == one.old for one in put)
+    return all(one.new == one.current_gain for one in put)
 
 
 COLUMNS = tuple(HistoryPoint.model_fields)

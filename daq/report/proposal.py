@@ -139,7 +139,7 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
 def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Table:
     """Make the table of current and new gains, with the figures to judge a change by."""
     current = ComparedGain.CURRENT.value
-    headings = ("axis", current, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %", "unit")
+    headings = ("axis", current, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "from it %", "unit")
     table = plain_table(headings, left=(0, len(headings) - 1))
     judged, _ = judge(changes, known)
     for change in changes:

@@ -63,7 +63,7 @@ def residual_view(
         yield ""
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
+    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(
@@ -210,7 +210,7 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     """Relative error of each axis before and after, and what noise alone would leave."""
-    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, error_rows(account))
+    return error_table("Relative error of the motor currents by ml [%]", axes, error_rows(account))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:

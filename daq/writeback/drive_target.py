@@ -147,7 +147,7 @@ def _unfit(path: Path, found: str) -> ControllerUnfit:
         str(path),
         found=found,
         expected="the record of a write to drives, as drivegain wrote it",
-        remedy="nothing was written; enter the old gains with the drives' own tool",
+        remedy="nothing was written; enter the previous gains with the drives' own tool",
     )
 
 

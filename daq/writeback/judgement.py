@@ -123,9 +123,12 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
 def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
     """Say what "more than noise" means for these changes, all from the same kind of gain."""
     exact = [change for change in changes if not known.stds.get(change.axis)]
-    taken = "by the σ of both gains"
+    taken = "σ of both gains is taken into account"
     if exact:
         listed = ", ".join(change.axis for change in exact)
         whose = "all axes" if len(exact) == len(changes) else listed
-        taken = f"with the {exact[0].compared_with.value} taken as exact ({whose})"
-    return f"more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
+        taken = f"the {exact[0].compared_with.value} is taken as exact on {whose}"
+    return (
+        f"more than noise: the probability that noise alone makes such a change, on any axis, is below "
+        f"{100 * FALSE_ALARM:g} %; {taken}"
+    )

@@ -271,7 +271,7 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
 def test_a_mistyped_nameplate_is_reported_with_its_line(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it.
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the current gain contradict it.
 
     The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a warning.
     """

@@ -540,7 +540,7 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed
         assert one.tolerance_std == pytest.approx(abs(one.per_kg) * 0.0459)
     verbose = residual_view(weighed, closed.account, calibration, verbose=True)
     sentences = [part.text for part in verbose if isinstance(part, Sentence)]
-    assert any("which is ± 1 % of every gain, not in σ" in one for one in sentences)
+    assert any("which is ± 1 % of every gain, not included in σ" in one for one in sentences)
     # The file has it, and one of an earlier version is read without.
     path = tmp_path / "calibration.yaml"
     save_calibration(calibration, path)
