@@ -218,7 +218,7 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
         console.print(f"{value.axis.name}, {value.parameter}: {value.value:.9g} -> {new:.9g}")
     if edit.record is not None:
         console.print(
-            f"These are the values before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
+            f"These are the gains before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
         )
 
 

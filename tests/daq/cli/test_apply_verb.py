@@ -244,10 +244,10 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
-    assert "Not in an audit" in capsys.readouterr().out
+    assert "No audit log has this rollback" in capsys.readouterr().out
     audit = tmp_path / "elsewhere.jsonl"
     assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
-    assert "Not in an audit" not in capsys.readouterr().out
+    assert "No audit log has this rollback" not in capsys.readouterr().out
     assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert main(["rollback"]) == ExitCode.USAGE
 

@@ -159,7 +159,7 @@ def test_an_interrupt_puts_back_what_was_written(
     with pytest.raises(typer.Exit) as caught:
         apply_in_drives(cell, yes=True)
     assert caught.value.exit_code == 130
-    assert "interrupted: kept: the old values are restored in J1, J2, J3" in capsys.readouterr().err
+    assert "interrupted: kept: the previous values are restored in J1, J2, J3" in capsys.readouterr().err
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
 
 

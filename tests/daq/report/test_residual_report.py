@@ -500,7 +500,7 @@ def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, colu
     for gain in calibration.gains:
         assert f"{gain.std_percent:.2f}" in screen.text
         assert f"{gain.change_percent:+.1f}" in screen.text
-    for statistics in ("Turn 1", "would have been detected", "Not added", "failed a check", "may have", "scales all"):
+    for statistics in ("Turn 1", "Detection limit", "Not added", "failed a check", "may have", "scales all"):
         assert statistics not in screen.text
 
 
@@ -890,7 +890,7 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     one_sided = GearLoss(motoring_rows=0.9, motoring_torque=0.97, loss=0.01, loss_std=0.04)
     both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
     text = next(_gear_sentence("J3", one_sided, in_model=False))
-    assert text.startswith("The gain of J3 carries the efficiency of its gear: the motor drives in 97 %")
+    assert text.startswith("The gain of J3 includes the efficiency of its gear: the motor drives in 97 %")
     assert "loss of up to 8.0 % would not show; it would change the gain by 7.5 %" in text
     assert not list(_gear_sentence("J3", both, in_model=False))
     found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
