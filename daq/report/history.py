@@ -485,7 +485,7 @@ _FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 Decembe
 
 
 def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
-    """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
+    """Draw gains ± 2σ, those that were written filled, alarms; CUSUM, trend and deviations over their limits.
 
     There is at least one series; the kind is png or svg.
     """

@@ -20,15 +20,15 @@ from ident.drift.change import DISPERSION, FALSE_ALARM, decide
 _LOG = logging.getLogger("drivegain")
 
 SAME_SIGMAS = 0.5
-"""A number in the controller's file that is as near to a gain of the history is that gain, rounded for the file."""
+"""A current gain that is as near to a gain of the history is that gain, rounded for the controller's file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
     """Figures of a history that a change is judged by; empty without a history."""
 
-    #: Σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken as
-    #: exact: a person entered that number, or the history does not have it.
+    #: σ of the current gains, by axis [unit of the gain]; a gain whose σ is missing, or 0, is taken as exact: a person
+    #: entered it, or the history does not have it.
     stds: Mapping[str, float] = field(default_factory=dict)
     #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a missing one.
     dispersions: Mapping[str, float] = field(default_factory=dict)
