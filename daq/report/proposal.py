@@ -246,7 +246,7 @@ def show_file_rollback(written: Written, console: Console) -> None:
     """Print a rollback of the controller's file as a diff and a line."""
     edit, backup = written.edit, written.backup
     _show_diff(terminal_lines(_rollback_diff(edit)), console)
-    replaced = "the file was gone" if backup is None else f"the content before is now {backup.name}"
+    replaced = "the file was gone" if backup is None else f"the replaced content is in {backup.name}"
     source = "" if edit.source is None else edit.source.name
     console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
 

@@ -284,7 +284,7 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
                 "shows it, or it left together with them."
             )
         elif verdict.written:
-            yield f"Undecided, and written as asked: {name}: {evidence}."
+            yield f"Undecided, and written because of --write-undecided: {name}: {evidence}."
         else:
             yield (
                 f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass --write-undecided to "
