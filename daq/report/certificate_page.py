@@ -278,7 +278,10 @@ def _old_comments(edit: FileEdit) -> Iterator[str]:
     comments = edit.comments
     if comments:
         axis, text = next(iter(comments.items()))
-        yield paragraph(f"The comments behind the gains were not changed. {axis}: “{text}”.")
+        yield paragraph(
+            "A write changes numbers only, so comments behind the gains may describe the previous gains. "
+            f"{axis}: “{text}”."
+        )
 
 
 def _digests(certificate: Certificate) -> str:
@@ -374,7 +377,7 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
             "Dependence of the gains on the payload's mass",
             paragraph(
                 "To first order. A wrong mass is in every gain; where the mass is all that is known of the payload, no "
-                "residual shows it. The part of σ that the tolerance of the weighing makes is not in σ of the gains."
+                "residual shows it. σ by the tolerance of the weighing is not included in σ of the gains."
             ),
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
