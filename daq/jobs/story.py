@@ -105,7 +105,7 @@ SENTENCES = {
     "found": "  {text}",
     "certificate": "Certificate: {page}",
     "drift": "! {axis}: {text}",
-    "compared with the gains in the controller": "\nCompared with the current gains: {words}.",
+    "compared with the gains in the controller": "\nCompared with the current gains, {words}.",
     "a check failed": "✗ {text}",
     "written to the controller's file": "Written to {file}. The previous content is in {backup}.",
     "proposed: an operator has to apply it": "Nothing was written.",

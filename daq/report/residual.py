@@ -468,7 +468,7 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
     elif not skew.confirmed:
         yield (
             "A time skew between currents and positions is not confirmed: instruments from the demanded motion give "
-            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms, which may be zero."
+            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
         )
 
 
