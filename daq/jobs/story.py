@@ -63,7 +63,7 @@ def _gains(fields: Fields) -> str:
     target = f"{worst['target_percent']:g} %"
     left_s = fields["left_s"]
     if left_s > 0.0:
-        lines.append(f"The target is ± {target}. {worst['axis']} needs the longest: by estimate {left_s:.0f} s more.")
+        lines.append(f"The target is ± {target}. {worst['axis']} needs the longest: about {left_s:.0f} s more.")
     else:
         lines.append(f"Every gain is within ± {target}: the recording is complete.")
     return "\n".join(lines)
