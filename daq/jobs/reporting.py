@@ -243,8 +243,8 @@ def _guided_lines(state: GuidedState) -> list[str]:
     if state.missing:
         lines += ["", f"Not reached: {state.missing}"]
     if state.acceptance is not None:
-        verdict = "accepted" if state.acceptance.accepted else "NOT ACCEPTED"
-        lines += ["", f"New moves: {verdict}: {state.acceptance.remark}"]
+        verdict = "Accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        lines += ["", f"{verdict} on new moves: {state.acceptance.remark}."]
     return lines
 
 
