@@ -894,7 +894,7 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
     text = next(_gear_sentence("J3", one_sided, in_model=False))
     assert text.startswith("The gain of J3 includes the efficiency of its gear: the motor drives in 97 %")
-    assert "loss of up to 8.0 % would not show; it would change the gain by 7.5 %" in text
+    assert "loss of up to 8.0 % would not show, and would change the gain by 7.5 %" in text
     assert not list(_gear_sentence("J3", both, in_model=False))
     found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
     assert "efficiency of 81.6 %" in next(_gear_sentence("J3", found, in_model=True))
