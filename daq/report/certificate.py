@@ -22,7 +22,7 @@ from daq.report.identity import identity
 from daq.report.proposal import Refused
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
-from daq.writeback.request import ComparedGain, GainChange
+from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
 
 
@@ -267,7 +267,7 @@ def certify(
         _require_whole(earlier)
         _require_same(calibration, earlier)
         gains = {gain.axis: gain.value for gain in earlier.gains}
-        changes = changes_from(gains, ComparedGain.EARLIER, calibration)
+        changes = changes_from(gains, GainOrigin.EARLIER, calibration)
         known = Spread({gain.axis: gain.std for gain in earlier.gains})
         since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
     origin = origin or Origin.of(calibration)

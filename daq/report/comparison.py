@@ -25,7 +25,7 @@ from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.judgement import NOTHING, Spread, known_of, query_history
-from daq.writeback.request import ComparedGain, Edit, GainChange, Request
+from daq.writeback.request import Edit, GainChange, GainOrigin, Request
 from daq.writeback.target import propose
 from ident.calibration import Calibration
 
@@ -98,7 +98,7 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
         cell: from the logs, None where there is none; then the default limits hold.
     """
     nameplates = {gain.axis: gain.nameplate for gain in calibration.gains}
-    changes = changes_from(nameplates, ComparedGain.NAMEPLATE, calibration)
+    changes = changes_from(nameplates, GainOrigin.NAMEPLATE, calibration)
     edit = Edit(subject="", before=b"", after=b"", changes=changes)
     refusals = check_gates(GateContext(Request(calibration, now), edit, cell))
     return Comparison(
@@ -110,7 +110,7 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
 
 
 def changes_from(
-    compared: Mapping[str, float], compared_with: ComparedGain, calibration: Calibration
+    compared: Mapping[str, float], compared_with: GainOrigin, calibration: Calibration
 ) -> tuple[GainChange, ...]:
     """Return the changes of the gains from others, by axis, that are in no file."""
     changes = []
@@ -194,7 +194,7 @@ def before_write(comparison: Comparison, digest: str) -> Comparison | None:
     if any(change.axis not in before for change in comparison.changes):
         return None
     changes = tuple(
-        replace(change, compared_gain=before[change.axis], compared_with=ComparedGain.PREVIOUS)
+        replace(change, compared_gain=before[change.axis], compared_with=GainOrigin.PREVIOUS)
         for change in comparison.changes
     )
     # The previous gains were those of another calibration: none is in force for them.

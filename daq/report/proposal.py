@@ -16,7 +16,7 @@ from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, Spread, judge, noise_note
-from daq.writeback.request import ComparedGain, Edit, GainChange
+from daq.writeback.request import Edit, GainChange, GainOrigin
 from daq.writeback.target import E, Proposal, Written
 
 
@@ -138,7 +138,7 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
 
 def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Table:
     """Make the table of current and new gains, with the figures to judge a change by."""
-    current = ComparedGain.CURRENT.value
+    current = GainOrigin.CURRENT.value
     headings = ("axis", current, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "from it %", "unit")
     table = plain_table(headings, left=(0, len(headings) - 1))
     judged, _ = judge(changes, known)

@@ -63,8 +63,8 @@ class Request:
         }
 
 
-class ComparedGain(Enum):
-    """Gain that a new one is compared with; the value is the word for it in messages."""
+class GainOrigin(Enum):
+    """Origin of the gain that a new one is compared with; the value is the word for it in messages."""
 
     CURRENT = "current gain"  #: what the controller has
     NAMEPLATE = "nameplate"  #: from the data sheet, as the cell file has it
@@ -85,7 +85,7 @@ class GainChange:
     unit: str  #: Nm at the joint per unit of the current-loop reference
     nameplate_gain: float  #: gain of the data sheet [unit]
     spelling: str  #: the new number as written, in the controller's own unit; empty where none can be written
-    compared_with: ComparedGain = ComparedGain.CURRENT
+    compared_with: GainOrigin = GainOrigin.CURRENT
 
     @classmethod
     def of(cls, gain: Gain, key: str, line: int, current_gain: float, planned: tuple[float, str] | None) -> GainChange:
@@ -96,7 +96,7 @@ class GainChange:
     @property
     def current_gain(self) -> float:
         """Gain that the controller has [unit]; NaN where the new one is compared with another gain."""
-        if self.compared_with is not ComparedGain.CURRENT:
+        if self.compared_with is not GainOrigin.CURRENT:
             return math.nan
         return self.compared_gain
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from daq.config.cell import CellAxis
 from daq.errors import SignatureInvalid, counted
 from daq.writeback.gates.gate import GateContext
-from daq.writeback.request import ComparedGain, GainChange, GateFinding, parse_base, short_digest
+from daq.writeback.request import GainChange, GainOrigin, GateFinding, parse_base, short_digest
 from daq.writeback.signature import signers_of
 from ident.calibration import Gain
 from ident.plausible import format_at_limit
@@ -123,7 +123,7 @@ def _keeps_sign(change: GainChange) -> bool:
 def _others_text(change: GainChange) -> str:
     """Return the current gain, where the controller was read, and the nameplate, each with its word."""
     nameplate = f"nameplate {change.nameplate_gain:g}"
-    if change.compared_with is ComparedGain.NAMEPLATE:
+    if change.compared_with is GainOrigin.NAMEPLATE:
         return nameplate
     return f"{change.compared_with.value} {change.compared_gain:g}, {nameplate}"
 
