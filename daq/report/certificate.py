@@ -34,7 +34,7 @@ class CertifiedGain(Report):
     """in the controller's file; null where it was not read"""
     line: int | None
     old: Figure
-    """current gain; the nameplate where the controller was not read; of `beside`, the earlier calibration's gain"""
+    """current gain, or the nameplate where the controller was not read; of `beside`, the earlier calibration's gain"""
     new: Figure
     std: float
     std_percent: Figure

@@ -129,7 +129,7 @@ class ProposedGain(Report):
     axis: str
     key: str
     old: Figure
-    """current gain"""
+    """current gain; the key keeps its name"""
     new: Figure
     std: float
     unit: str

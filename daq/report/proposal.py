@@ -37,7 +37,7 @@ class FileGain(Report):
     key: str
     line: int
     old: Figure
-    """current gain"""
+    """current gain; the key keeps its name"""
     new: Figure
     """as it is read back; null where there is none to write"""
     change_percent: Figure
@@ -70,7 +70,7 @@ class RestoredObject(Report):
     axis: str
     object: str
     old: Figure
-    """null where the drive has no number"""
+    """current gain, as a number of the drive; null where the drive has none"""
     new: Figure
 
 
