@@ -1,4 +1,4 @@
-"""Calibrate the drive gains of a robot cell: from recorded logs to the numbers in the controller.
+"""Calibrate the drive gains of a robot cell: from recorded logs to the current gains of its controller.
 
 Everything that a program needs is here; importing `daq` loads no module before a name is used::
 

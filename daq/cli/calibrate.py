@@ -215,7 +215,7 @@ def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
     def save_report(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
         certificate = save_certificate(cell_file, cell, fitted, changed, calibration, folder)
         tell("")
-        tell(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
+        tell(f"Verdict: {certificate.sentence}", bold=True)
         open_page(folder / PAGE)
 
     def record_with_bar(request: RecordingRequest, **further: Any) -> Recorded:

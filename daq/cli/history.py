@@ -45,7 +45,8 @@ def history_verb(
     csv: Annotated[Path | None, output_option("--csv", "Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
-        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
+        str | None,
+        typer.Option("--acknowledge", metavar="AXIS", help="The change of an axis is explained: begin a new baseline."),
     ] = None,
     by: Annotated[str | None, typer.Option("--by", help="With --acknowledge: who explains it; you by default.")] = None,
     why: Annotated[str | None, typer.Option("--why", help="With --acknowledge: what happened.")] = None,
@@ -62,7 +63,7 @@ def history_verb(
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
 
     An alarm means that a gain has changed by more than noise: a drift that adds up (CUSUM), a steady trend, or one
-    calibration far off. What it may come from is asked, not claimed. docs/evidence/drift.md says how often an alarm is
+    calibration far off. Possible causes are printed as questions. docs/evidence/drift.md says how often an alarm is
     false.
     """
     from daq.ledger.ledger import MAY_LACK, Ledger

@@ -383,7 +383,7 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         ((key, gain),) = axis.nameplate_gains.items()
         if not gain:
-            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
+            yield Fault(("axes", index, key), "0", "the nameplate gain of the data sheet, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]

@@ -43,8 +43,8 @@ class HoldOut(Enum):
 class ApplyPolicy:
     """Bounds of the write-back."""
 
-    max_change_percent: _Percent = 35.0  #: change from the gain in the controller file [%]
-    max_nameplate_percent: _Percent = 50.0  #: change from the manufacturer's gain [%]
+    max_change_percent: _Percent = 35.0  #: change from the current gain [%]
+    max_nameplate_percent: _Percent = 50.0  #: change from the nameplate [%]
     max_std_percent: _Percent = 3.0  #: relative standard deviation of the identified gain [%]
     max_error_percent: _Percent = 25.0  #: relative error of all torques, on held-out data where available [%]
     max_axis_error_percent: _Percent = 50.0  #: the same for each axis [%]
@@ -57,7 +57,7 @@ class ApplyPolicy:
     #: Public key (minisign) of each person who may sign, by name.
     signers: Mapping[str, str] = field(default_factory=dict)
     holdout: HoldOut | None = None  #: whether held-out data are required; None means required if the job itself applies
-    #: Largest change from the gain in the controller file, by axis name [unit of the gain].
+    #: Largest change from the current gain, by axis name [unit of the gain].
     max_change: Mapping[str, Annotated[float, Field(ge=0)]] = field(default_factory=dict)
 
     @property

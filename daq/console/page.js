@@ -367,7 +367,7 @@ function showResults(found) {
   const parts = found.problems.map((text) => prose("p", text, "alarm"));
   if (found.gains) {
     parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}; error on ${found.gains.error}`));
-    parts.push(table(["axis", "gain ± σ", "since nameplate", "error"],
+    parts.push(table(["axis", "gain ± σ", "from nameplate", "error"],
       found.gains.axes.map((one) => [one.axis, `${withDeviation(one.value, one.std)} ${one.unit}`,
         signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)}\u00a0%`])));
   } else parts.push(prose("p", "No calibration yet. After the recordings: `drivegain fit LOG … --out calibration.yaml`"));

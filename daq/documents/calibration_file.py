@@ -58,7 +58,7 @@ def _check_filter(found: dict[str, int | float | list[float]]) -> dict[str, int 
 
 
 class GainEntry(StrictModel):
-    """One drive gain; the percentages are for people."""
+    """One drive gain with its nameplate; the percentages are for people, `change_percent` from the nameplate."""
 
     axis: str
     value: _Number

@@ -17,7 +17,7 @@ class Outcome(Enum):
 
     NOT_DUE = "not due"  #: The last good calibration is recent enough; no session was begun
     APPLIED = "applied"
-    UNCHANGED = "unchanged"  #: No gain differs significantly from the controller's
+    UNCHANGED = "unchanged"  #: No gain differs significantly from the current gain
     PROPOSED = "proposed"  #: An operator has to apply it
     REFUSED = "refused"  #: A check of the write-back failed
     UNFIT = "unfit"  #: The recordings cannot be used
@@ -54,15 +54,18 @@ class Fitted(StrictModel):
 
 
 class JudgedGain(StrictModel):
-    """A gain beside the one in the controller, with their σ, and whether they differ significantly."""
+    """An identified gain beside the current gain, with their σ, and whether they differ significantly.
+
+    `old` and `new` are keys of `state.json` and of `--json`, which stay.
+    """
 
     axis: str
     unit: str
-    old: float
-    old_std: float
-    new: float
-    new_std: float
-    change_percent: float | None  #: None where the number in the controller is 0
+    old: float  #: current gain
+    old_std: float  #: σ of the current gain; 0 where it is not known
+    new: float  #: identified gain
+    new_std: float  #: σ of the identified gain
+    change_percent: float | None  #: None where the current gain is 0
     drift_sigma: float | None  #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
     differs: bool
 
@@ -161,8 +164,8 @@ class ScaleOfAxis(StrictModel):
     """Measured over predicted torque of a joint on new moves: 1 where its gain is right."""
 
     axis: str
-    old: float  #: with the gain that the controller had
-    new: float  #: with the one that was written
+    old: float  #: with the previous gain, which the controller had before the write
+    new: float  #: with the current gain, which was written
     std: float  #: σ of the new one
 
 
@@ -171,8 +174,8 @@ class Acceptance(StrictModel):
 
     log_sha256: str
     scales: tuple[ScaleOfAxis, ...]
-    old_error_percent: float  #: of all axes
-    new_error_percent: float
+    old_error_percent: float  #: of all axes, with the previous gains
+    new_error_percent: float  #: of all axes, with the current gains
     accepted: bool
     remark: str
 

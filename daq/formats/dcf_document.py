@@ -102,7 +102,7 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(
                 key,
                 f"[{section.title}] without ParameterValue",
-                "a data sheet (EDS) has none: give the device's DCF, or add the line with the value of now",
+                "a data sheet (EDS) has none: give the device's DCF, or add the line with the current gain",
             )
         kind = self._number(entries, key, _TYPE, 0)
         where = f"line {entry.line}: {entry.value!r:.60}"

@@ -1,4 +1,4 @@
-"""The last stage of a guided session: new moves with what the controller has now, and a verdict."""
+"""The last stage of a guided session: new moves with the current gains, and a verdict."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOLERANCE = 0.02  #: Distance from 1 that is no mistake: friction of another mom
 
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """Record a short run of new moves, and compare the torques of old and new gains with the predicted ones."""
+    """Record new moves, and compare the torques by the previous and the current gains with the predicted ones."""
 
     duration_s: float = DURATION_S
 
@@ -56,8 +56,8 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     """Compare predicted torques with those of the currents, by the gains before and after the write."""
     calibration = calibration_made(session)
     decision = session.state.decision
-    old_gains = {} if decision is None else {gain.axis: gain.old for gain in decision.gains}
-    before = _predicted(_with_gains(calibration, old_gains), context, session)
+    previous_gains = {} if decision is None else {gain.axis: gain.old for gain in decision.gains}
+    before = _predicted(_with_gains(calibration, previous_gains), context, session)
     after = _predicted(calibration, context, session)
     scales = tuple(
         ScaleOfAxis(axis=axis, old=old, new=new, std=std)
@@ -67,12 +67,12 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     )
     off = [one for one in scales if abs(one.new - 1.0) > max(SIGMAS * one.std, TOLERANCE)]
     remark = (
-        f"the error of the torques is {after.error.total:.2f} % with the new gains, {before.error.total:.2f} % with "
-        "the old ones"
+        f"the error of the torques is {after.error.total:.2f} % with the current gains, {before.error.total:.2f} % "
+        "with the previous gains"
     )
     if off:
         listed = ", ".join(f"{one.axis} {100.0 * (one.new - 1.0):+.1f} ± {100.0 * one.std:.1f} %" for one in off)
-        remark = f"torques by the new gains are not those that the model predicts: {listed}"
+        remark = f"torques by the current gains are not those that the model predicts: {listed}"
     return Acceptance(
         log_sha256=sha256_of(log_of(session, RUN)) or "",
         scales=scales,
@@ -108,6 +108,6 @@ def _predicted(calibration: Calibration, context: SessionContext, session: Sessi
 
 
 def _with_gains(calibration: Calibration, values: dict[str, float]) -> Calibration:
-    """Return a calibration with the gains that the controller had."""
+    """Return a calibration with other gains, by axis."""
     gains = tuple(replace(gain, value=values.get(gain.axis, gain.value)) for gain in calibration.gains)
     return replace(calibration, gains=gains)

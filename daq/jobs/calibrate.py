@@ -123,7 +123,7 @@ def check_readiness(context: SessionContext, payload: str | None, block_s: float
         _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
         _checked("payload", lambda: _payload_text(context.cell, payload)),
         _checked("disk, interlock, drives", lambda: _ready_text(context)),
-        _checked("gains that a first session can show", lambda: _predicted_text(context, block_s)),
+        _checked("expected precision", lambda: _predicted_text(context, block_s)),
     )
 
 
@@ -175,4 +175,4 @@ def _predicted_text(context: SessionContext, block_s: float) -> str:
     plan = context.tools.plan(context.cell, seed=context.settings.seed, duration_s=block_s)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
-    return f"σ predicted for one bare and one loaded block: {listed}"
+    return f"predicted σ after one bare and one loaded block: {listed}"

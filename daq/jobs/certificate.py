@@ -20,7 +20,7 @@ from ident.discovery.before_after import Account
 def save_certificate(
     cell_file: Path, cell: Cell, fitted: Fit, changed: Account, calibration: Calibration, folder: Path
 ) -> Certificate:
-    """Write the page of a session, with the gains beside those in the controller.
+    """Write the page of a session, with the gains beside the current ones.
 
     Args:
         cell_file: for the command that the page shows.

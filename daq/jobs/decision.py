@@ -1,4 +1,4 @@
-"""Compare a calibration with the gains in the controller, and write it where the operator approves."""
+"""Compare a calibration with the current gains, and write it where the operator approves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DIFF = "proposal.diff"
 
 
 def decide_outcome(context: SessionContext, session: Session, calibration: Calibration, history: History) -> Session:
-    """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
+    """Compare a calibration with the current gains, and act on it; the outcome is in the returned state.
 
     Raises:
         CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
@@ -108,13 +108,13 @@ def _apply(context: SessionContext, proposal: Proposal[FileEdit], now: datetime)
 
 
 def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
-    """Judge which gains differ significantly from the controller's (`daq.writeback.judgement`), each among all axes."""
+    """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`), each among all axes."""
     judged, words = judge(proposal.edit.changes, known)
     gains = tuple(
         JudgedGain(
             axis=change.axis,
             unit=change.unit,
-            old=change.old,
+            old=change.current_gain,
             new=change.new,
             old_std=known.stds[change.axis],
             new_std=change.std,
@@ -164,7 +164,7 @@ def _proposed_gain(change: GainChange) -> ProposedGain:
     return ProposedGain(
         axis=change.axis,
         key=change.key,
-        old=change.old,
+        old=change.current_gain,
         new=change.new,
         std=change.std,
         unit=change.unit,

@@ -105,9 +105,9 @@ def preview(
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
-        steps += ["fit and close the loop"]
-    steps += ["compare with the controller's gains", f"apply by {cell.apply.by.value}", "report"]
-    taken = "a new session" if session is None else f"session {session.state.session} is taken up"
+        steps += ["identify gains and missing effects"]
+    steps += ["compare with the current gains", f"write, approved by: {cell.apply.by.value}", "report"]
+    taken = "a new session" if session is None else f"session {session.state.session} continues"
     return Preview(tuple(steps), taken)
 
 
@@ -185,8 +185,8 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
             "the job",
             found=f"more than {minutes:g} min since it began",
             expected="its end within max_duration_min",
-            remedy="the axes were commanded to stop; the next job resumes the session; raise max_duration_min, or "
-            "see what takes so long in its log",
+            remedy="the axes were commanded to stop, and the next job continues the session; find in the log what "
+            "takes so long, or raise max_duration_min",
         )
 
     @contextmanager

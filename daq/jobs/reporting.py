@@ -188,7 +188,7 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
     if session is not None:
         state = session.state
         lines += [
-            f"Session {state.session} of cell {state.cell}, begun {state.began}, job {state.attempt} of it.",
+            f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt {state.attempt}.",
             *(
                 f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
                 f"recording{'s' * (run.attempts != 1)}"
@@ -203,8 +203,8 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                 change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
                 drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
                 lines.append(
-                    f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} "
-                    f"{gain.unit} found{change}{drift}{': differs' if gain.differs else ''}"
+                    f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± {gain.new_std:.2g} "
+                    f"{gain.unit}{change}{drift}{': differs' if gain.differs else ''}"
                 )
         if isinstance(state, GuidedState):
             lines += _guided_lines(state)
@@ -243,8 +243,8 @@ def _guided_lines(state: GuidedState) -> list[str]:
     if state.missing:
         lines += ["", f"Not reached: {state.missing}"]
     if state.acceptance is not None:
-        verdict = "accepted" if state.acceptance.accepted else "NOT ACCEPTED"
-        lines += ["", f"New moves: {verdict}: {state.acceptance.remark}"]
+        verdict = "Accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        lines += ["", f"{verdict} on new moves: {state.acceptance.remark}."]
     return lines
 
 
@@ -259,7 +259,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
         return [
             *([sign] if session.state.target.unsigned else []),
             f"drivegain apply {cell} {calibration}",
-            "check the change, and if it is right, write it:",
+            "if the change that it shows is right, write it:",
             f"drivegain apply {cell} {calibration} --yes --base {session.state.target.looked_at}",
         ]
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
@@ -268,10 +268,13 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
             f"to undo it: drivegain rollback {shlex.quote(str(cell_file.absolute()))}",
         ]
     return {
-        Outcome.REFUSED: ["see which check failed; the next job records anew"],
-        Outcome.UNFIT: ["see what is wrong with the recordings (`drivegain info LOG`); the next job records anew"],
-        Outcome.STOPPED: ["remove the cause; the next job resumes this session while it is recent"],
-        Outcome.INTERRUPTED: ["nothing, or run the job again: it resumes this session while it is recent"],
+        Outcome.REFUSED: ["find out why the check failed; the same command then begins a new session"],
+        Outcome.UNFIT: [
+            "find out what is wrong with the recordings (`drivegain info LOG`); the same command then begins a new "
+            "session"
+        ],
+        Outcome.STOPPED: ["remove the cause; the same command continues this session while it is recent"],
+        Outcome.INTERRUPTED: ["nothing, or the same command again: it continues this session while it is recent"],
     }.get(outcome, ["nothing"])
 
 
@@ -338,8 +341,8 @@ def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: 
         for watched in state.watched:
             alarm.labels(cell, watched.axis).set(float(bool(watched.alarm)))
     if state.decision is not None:
-        drift = gauge("gain_drift_sigma", "Change from the gain in the controller, in σ of the change.", "axis")
-        in_force = gauge("gain_in_force", "In the controller when the job looked, in Nm or N per A.", "axis", "unit")
+        drift = gauge("gain_drift_sigma", "Change from the current gain, in σ of the change.", "axis")
+        in_force = gauge("gain_in_force", "Current gain when the job looked, in Nm or N per A.", "axis", "unit")
         for gain in state.decision.gains:
             in_force.labels(cell, gain.axis, gain.unit).set(gain.old)
             if gain.drift_sigma is not None:

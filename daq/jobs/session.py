@@ -182,12 +182,12 @@ def last_good(found: tuple[Session, ...]) -> Session | None:
 
 
 def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:
-    """Remove old sessions, except the last good one and those whose gains a controller has.
+    """Remove old sessions, except the last good one and those whose calibration is in force.
 
     Args:
         found: oldest first.
         keep: number of the newest sessions to keep.
-        in_force: digests of the calibrations whose gains a controller has: their logs and signatures are its evidence.
+        in_force: digests of the calibrations in force: their logs and signatures are the evidence for current gains.
 
     Returns:
         folders that were removed; one that the file system does not release is skipped.

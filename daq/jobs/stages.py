@@ -78,7 +78,7 @@ class WatchDrift:
 
 
 class Decide:
-    """Compare the gains with those in the controller, and write them where the operator approves."""
+    """Compare the gains with the current ones, and write them where the operator approves."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
         """See `daq.jobs.decision.decide_outcome`."""

@@ -63,10 +63,7 @@ def _gains(fields: Fields) -> str:
     target = f"{worst['target_percent']:g} %"
     left_s = fields["left_s"]
     if left_s > 0.0:
-        lines.append(
-            f"The target is ± {target}. {worst['axis']} needs the longest: about {left_s:.0f} s more, if σ falls with "
-            "the root of the time."
-        )
+        lines.append(f"The target is ± {target}. {worst['axis']} needs the longest: about {left_s:.0f} s more.")
     else:
         lines.append(f"Every gain is within ± {target}: the recording is complete.")
     return "\n".join(lines)
@@ -92,25 +89,25 @@ PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
 
 SENTENCES = {
     "session begun": "A new session begins. Its files are in {folder}.",
-    "session taken up": "The session goes on where it was. Recorded already: {recorded}.",
-    "an unfinished session is not taken up": "! The unfinished session in {folder} is left as it is: {reason}.",
+    "session taken up": "The session continues. Already recorded: {recorded}.",
+    "an unfinished session is not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
     "the interlock lets the robot move": "Checked: disk, history and interlock.",
     "drives are as declared, without fault and without power": "Checked: the drives.",
-    "moves to look at": "\nThe moves of {run}, to look at first: {page}",
+    "moves to look at": "\nLook at the moves of {run} first: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
-    "recording is invalid": "! This recording cannot be used ({reason}); it is kept, and the block is recorded again.",
-    "set aside": "The earlier recording is kept as {log}.",
+    "recording is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is recorded again.",
+    "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",
     "weighed": "The moves show about {added_kg:.2g} kg more on the flange than without load.",
     "mistake in a block": "\n! {text}",
-    "kept as it is": "{block} is kept as it is.",
+    "kept as it is": "{block} is used as it is.",
     "the blocks so far do not give the gains": "\n! The blocks so far give no gains: {text}",
     "found": "  {text}",
     "certificate": "Certificate: {page}",
     "drift": "! {axis}: {text}",
-    "compared with the gains in the controller": "\nBeside the gains in the controller: {words}.",
+    "compared with the gains in the controller": "\nCompared with the current gains, {words}.",
     "a check failed": "✗ {text}",
-    "written to the controller's file": "Written to {file}. The content before is in {backup}.",
+    "written to the controller's file": "Written to {file}. The previous content is in {backup}.",
     "proposed: an operator has to apply it": "Nothing was written.",
     "session ended": "",  # the end of the session or the error follows
     "accepted": "✓ Accepted: {text}.",

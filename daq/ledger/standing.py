@@ -40,7 +40,7 @@ class Standing:
     write: Event | None = None  #: last write of its gains, one that is in force if there is any; None if never written
     #: Next write or rollback at the same place; None while the gains are in force.
     ended: Event | None = None
-    #: Gains that were at that place before the write, by axis; empty where the ledger does not have them.
+    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have them.
     before: Mapping[str, float] = field(default_factory=dict)
     acceptance: RecordedAcceptance | None = None  #: the last one
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
@@ -107,7 +107,7 @@ def _next_at_its_place(history: History, write: Event) -> Event | None:
 
 
 def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, float]:
-    """Return the gains that a controller's file had before a write, by axis; none where the audit log lacks them."""
+    """Return the previous gains, those before a write, by axis; none where the audit log lacks them."""
     by_digest = {entry.sha256: entry for entry in entries}
     by_number = {entry.number: entry for entry in entries}
     ended = by_digest.get(write.audit or "")

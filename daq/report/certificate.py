@@ -1,4 +1,4 @@
-"""The certificate of a calibration: its gains beside those in the controller, the limits, and one verdict.
+"""The certificate of a calibration: its gains beside the current ones, the limits, and one verdict.
 
 The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond noise.
 """
@@ -22,18 +22,19 @@ from daq.report.identity import identity
 from daq.report.proposal import Refused
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
-from daq.writeback.request import GainChange
+from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
 
 
 class CertifiedGain(Report):
-    """A gain beside the one in the controller, or beside the nameplate."""
+    """A gain beside the current one, or beside the nameplate."""
 
     axis: str
     key: str | None
     """in the controller's file; null where it was not read"""
     line: int | None
     old: Figure
+    """current gain, or the nameplate where the controller was not read; of `beside`, the earlier calibration's gain"""
     new: Figure
     std: float
     std_percent: Figure
@@ -97,8 +98,6 @@ class CertificateReport(Report):
     beside: EarlierCalibration | None
 
 
-EARLIER = "earlier calibration"  #: What `since` compares with
-BEFORE = "previous gain"  #: What a written calibration is compared with
 _ID_DIGITS = 12  #: As history and audit log shorten a digest
 
 
@@ -116,16 +115,17 @@ class Verdict(Enum):
 class AxisRow:
     """One gain of the certificate."""
 
-    change: GainChange  #: gain in the controller, or nameplate, and identified one with its σ
+    change: GainChange  #: identified gain with its σ, and the one that it is compared with
     allowed_percent: tuple[float, float]  #: limits of the change
     judged: JudgedChange  #: NaN where it cannot be judged
     refusals: tuple[Refusal, ...]  #: failed checks of this axis
 
-    def words(self, place: str) -> str:
-        """Verdict in words; `place` has the other gain: the controller or the nameplate."""
+    @property
+    def words(self) -> str:
+        """Verdict in words."""
         if self.refusals:
             return "; ".join(f"refused: {refusal.found}" for refusal in self.refusals)
-        return f"differs from the {place}" if self.significant else "same within noise"
+        return f"differs from the {self.change.compared_with.value}" if self.significant else "same within noise"
 
     @property
     def significant(self) -> bool:
@@ -158,8 +158,8 @@ class Certificate:
     calibration: Calibration
     comparison: Comparison
     origin: Origin
-    rows: tuple[AxisRow, ...]  #: change from the controller or the nameplate, one an axis
-    #: Comparison with the gains before the write that is in force; None without one, or where they are not known.
+    rows: tuple[AxisRow, ...]  #: change from the current gain or the nameplate, one an axis
+    #: Comparison with the previous gains, those before the write that is in force; None where there is none of them.
     before: Comparison | None = None
     changed: tuple[AxisRow, ...] = ()  #: change by that write, one an axis; empty without it
     earlier: Calibration | None = None  #: another calibration of the cell to compare with
@@ -167,28 +167,20 @@ class Certificate:
     since: tuple[AxisRow, ...] = ()
 
     @property
-    def place(self) -> str:
-        """Name of the gains that `rows` compares with."""
-        return "nameplate" if self.comparison.edit is None else "current gain"
-
-    @property
     def shown(self) -> tuple[AxisRow, ...]:
         """Change of each gain as the page shows it: by the write, once the gains are written."""
         return self.changed or self.rows
 
     @property
-    def shown_place(self) -> str:
-        """Name of the gains that `shown` compares with."""
-        return self.place if self.before is None else BEFORE
+    def compared_with(self) -> str:
+        """Word for the gains that `shown` compares with, the same on every axis."""
+        return self.shown[0].change.compared_with.value
 
     @property
     def note(self) -> str:
         """Meaning of a difference beyond noise, as `apply` states it."""
-        if self.before is not None:
-            return noise_note(self.before.changes, self.before.known, "the previous gain")
-        comparison = self.comparison
-        old = "the nameplate" if comparison.edit is None else "the number in the controller"
-        return noise_note(comparison.changes, comparison.known, old)
+        comparison = self.before or self.comparison
+        return noise_note(comparison.changes, comparison.known)
 
     @property
     def verdict(self) -> Verdict:
@@ -207,23 +199,23 @@ class Certificate:
         """The verdict in one sentence; of gains that are in force, who has written them."""
         differing = [row for row in self.shown if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
-        furthest = "" if most is None else f"{most.change.axis} by {most.change.change_percent:+.1f} %"
+        furthest = "" if most is None else f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
         total = len(self.shown)
         count = f"all {total} gains" if len(differing) == total else f"{len(differing)} of {total} gains"
         write = self.comparison.in_force
         if write is not None:
-            return self._written_sentence(write, f"{count} changed by more than noise, most {furthest}")
+            return self._written_sentence(write, f"{count} changed by more than noise, {furthest}")
         match self.verdict:
             case Verdict.REFUSED:
                 return f"Must not be written: {self._reason}."
             case Verdict.UNCHANGED:
-                return "Nothing to change: no gain differs from the one in the controller by more than noise."
+                return "Nothing to change: no gain differs from the current gain by more than noise."
             case Verdict.WAITING:
                 remedy = self.comparison.refusals[0].remedy
-                return f"Waits for an operator: {count} change, most {furthest}; {remedy}."
+                return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
-                return f"Ready to be written: {count} change by more than noise, most {furthest}; every check passed."
-        differ = f"{count} differ from the nameplate by more than noise, most {furthest}"
+                return f"Ready to be written: {count} change by more than noise, {furthest}. Every check passed."
+        differ = f"{count} differ from the nameplate by more than noise, {furthest}"
         return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
 
     @property
@@ -274,7 +266,8 @@ def certify(
     if earlier is not None:
         _require_whole(earlier)
         _require_same(calibration, earlier)
-        changes = changes_from({gain.axis: gain.value for gain in earlier.gains}, calibration)
+        gains = {gain.axis: gain.value for gain in earlier.gains}
+        changes = changes_from(gains, GainOrigin.EARLIER, calibration)
         known = Spread({gain.axis: gain.std for gain in earlier.gains})
         since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
     origin = origin or Origin.of(calibration)
@@ -338,7 +331,7 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     edit = comparison.edit
     beside = None
     if certificate.earlier is not None:
-        since = [_certified_gain(row, EARLIER) for row in certificate.since]
+        since = [_certified_gain(row) for row in certificate.since]
         beside = EarlierCalibration.of(certificate.earlier, axes=since)
     return CertificateReport.of(
         certificate,
@@ -351,7 +344,7 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         identity=identity(calibration),
         controller=None if edit is None else str(edit.file),
         controller_unread=comparison.unread or None,
-        axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
+        axes=[_certified_gain(row) for row in certificate.rows],
         effects=[
             CertifiedEffect.of(one, effect=accepted_text(one, calibration), size=size_text(one, calibration))
             for one in calibration.effects
@@ -360,14 +353,16 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     )
 
 
-def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
+def _certified_gain(row: AxisRow) -> CertifiedGain:
     change = row.change
     return CertifiedGain.of(
         change,
         row,
         key=change.key or None,
         line=change.line or None,
+        old=change.compared_gain,
+        nameplate=change.nameplate_gain,
         written=change.spelling or None,
         change_sigmas=row.judged.sigmas,
-        verdict=row.words(place),
+        verdict=row.words,
     )

@@ -69,7 +69,7 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
     """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
     true = ("truth", "error %") if truth else ()
-    headings = ("axis", "a priori", "identified ± σ", "σ %", "change %", *true, "unit")
+    headings = ("axis", "nameplate", "identified ± σ", "σ %", "change %", *true, "unit")
     table = plain_table(headings, title=title, left=(0, len(headings) - 1))
     for gain in gains:
         row = [
@@ -183,13 +183,13 @@ def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
             listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
             wrong = f"the gains are wrong by: {listed}"
             at_most = "at most "
-        text = f"with a mass of {one.payload} that is wrong by 1 %, {wrong}"
+        text = f"if the mass of {one.payload} is wrong by 1 %, {wrong}"
         if one.tolerance_kg > 0.0:
             largest = max(abs(gain.percent_per_percent) for gain in one.gains)
             share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
             text += (
                 f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
-                f"± {share_percent:.2g} % of every gain, not in σ"
+                f"± {share_percent:.2g} % of every gain, not included in σ"
             )
         yield text
 

@@ -124,11 +124,12 @@ class SessionReport(GuidedState, ConcludedJob):
 
 
 class ProposedGain(Report):
-    """A gain in the controller's file and the one that a job proposes."""
+    """A current gain in the controller's file, and the gain that a job proposes."""
 
     axis: str
     key: str
     old: Figure
+    """current gain; the key keeps its name"""
     new: Figure
     std: float
     unit: str

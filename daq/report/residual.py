@@ -63,7 +63,7 @@ def residual_view(
         yield ""
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the a priori gain")
+    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(
@@ -210,7 +210,7 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     """Relative error of each axis before and after, and what noise alone would leave."""
-    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, error_rows(account))
+    return error_table("Relative error of the motor currents by ml [%]", axes, error_rows(account))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
@@ -284,7 +284,7 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
                 "shows it, or it left together with them."
             )
         elif verdict.written:
-            yield f"Undecided, and written as asked: {name}: {evidence}."
+            yield f"Undecided, and written because of --write-undecided: {name}: {evidence}."
         else:
             yield (
                 f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass --write-undecided to "
@@ -429,7 +429,7 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
             when, causes = _FLOOR_CAUSES[floor.source]
             yield (
                 f"{axis} has no noise floor: its current {when} scatters {floor.noise_a / left_a:.1f} times "
-                f"as much as the model's error in motion; possible causes: {causes}."
+                f"as much as the model's error in motion. Possible causes: {causes}."
             )
 
 
@@ -467,8 +467,8 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         )
     elif not skew.confirmed:
         yield (
-            "A time skew between currents and positions is not confirmed: by instruments from the demanded motion it "
-            f"is {1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms, which may be zero."
+            "A time skew between currents and positions is not confirmed: instruments from the demanded motion give "
+            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
         )
 
 
@@ -485,15 +485,15 @@ def gear_sentences(fitted: Fit) -> Iterator[str]:
 def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str]:
     if in_model and gear.efficiency is not None and gear.gain_factor is not None:
         yield (
-            f"The loss in the gear of {name} is an efficiency of {100.0 * gear.efficiency:.1f} % if motor and load "
-            f"lose the same share; its motor's gain is then {100.0 * (gear.gain_factor - 1.0):.2f} % larger than the "
-            "one found, which no residual can show."
+            f"If motor and load lose the same share, the gear of {name} has an efficiency of "
+            f"{100.0 * gear.efficiency:.1f} %. The gain of its motor is then "
+            f"{100.0 * (gear.gain_factor - 1.0):.2f} % larger than the identified one, which no residual can show."
         )
     elif gear.gain_carries_it and gear.hidden_shift is not None and gear.loss_std is not None:
         side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
         yield (
-            f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
-            f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it "
+            f"The gain of {name} includes the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of "
+            f"the squared load torque. A loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show, and "
             f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
         )
 
@@ -605,6 +605,6 @@ def _silence(fitted: Fit) -> str:
     clockless = len(trained) > 1 and session_began_s(trained) is None
     unseen = " The runs have no common clock: a warm-up over the session cannot be seen." if clockless else ""
     return (
-        f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
-        f"square in motion): {limits}.{unseen}"
+        f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean square in motion: "
+        f"{limits}.{unseen}"
     )

@@ -115,7 +115,7 @@ def residual_page(
         folded("What was found, in sentences", html_list(sentences)),
         folded(
             "Errors without and with the effects",
-            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
+            table("Relative error of the motor currents [%]", ("", *axes, "total"), errors, "names"),
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
@@ -180,7 +180,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 def _gains(fitted: Fit, account: Account) -> str:
     if fitted.estimate.gains_fixed:
-        return folded("Gains without and with the effects", paragraph("The gains were held at their nameplate values."))
+        return folded("Gains without and with the effects", paragraph("The gains were held at the nameplate."))
     rows = []
     shifts = []
     for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):

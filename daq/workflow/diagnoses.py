@@ -423,8 +423,8 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
     if check is None or not check.hidden_zeros:
         return ""
     names = [axes[axis] for axis in check.hidden_zeros]
-    subject = "The zeros of" if len(names) > 1 else "The zero of"
+    subject = "the zeros of" if len(names) > 1 else "the zero of"
     return (
-        f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
+        f"These data do not show {subject} {' and '.join(names)}: about a vertical axis, or behind the last joint, "
         "another zero makes nearly the same torques."
     )

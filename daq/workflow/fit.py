@@ -571,7 +571,7 @@ def _calibration(fitted: Fit) -> Calibration:
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
-    """Hold-out error with the nameplate's gains: same model, effects included, parameters refitted.
+    """Hold-out error with the nameplate gains: same model, effects included, parameters refitted.
 
     Without the effects, their share would be credited to the gains. The total weighs the axes by ‖Y_j‖ of the
     calibration, because smaller gains alone would lower it otherwise.

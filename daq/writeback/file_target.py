@@ -210,7 +210,8 @@ class FileTarget:
             return {"restored": edit.source.name}
         changes = []
         for change in edit.changes:
-            numbers = {"old": change.old, "new": change.new, "std": change.std}
+            # "old" is the key of the current gain in every audit log.
+            numbers = {"old": change.current_gain, "new": change.new, "std": change.std}
             finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
             changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
         return {"changes": changes}

@@ -116,14 +116,14 @@ def test_new_moves_show_which_gains_were_wrong_before_the_write(whole_session: t
     assert acceptance.accepted
     assert acceptance.new_error_percent < acceptance.old_error_percent
     by_axis = {scale.axis: scale for scale in acceptance.scales}
-    # The file had 25 % more than the truth for J4: its torque by the old gain is as much too large.
+    # The previous gain of J4 is 25 % larger than the truth, so its torque is as much too large.
     assert by_axis["J4"].old == pytest.approx(11.52 / 9.21, rel=0.02)
     assert all(abs(scale.new - 1.0) < 0.02 for scale in acceptance.scales)
 
 
 def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, made_session: MadeSession) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
-    # The controller took other gains than it was given: the old ones.
+    # The controller did not take the gains that were written: it has the previous gains.
     rig.tools = replace(rig.tools, validate=lambda *_: (made_session.before,))
     assert run_session(rig).outcome is Outcome.APPLIED
     acceptance = state_of(rig).acceptance
@@ -571,7 +571,7 @@ def test_a_person_may_keep_a_block_with_a_mistake(
 
 
 def test_the_moves_show_what_is_on_the_flange(whole_session: tuple[Rig, MadeSession]) -> None:
-    """Weighed with the gains of the data sheet, which are up to 25 % off, from the recordings of a real session."""
+    """Weighed with the nameplate gains, which are up to 25 % off, from the recordings of a real session."""
     rig, made = whole_session
     bare = made.logs["block-1-bare"]
     loaded = made.logs["block-2-loaded"]

@@ -423,7 +423,10 @@ def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed)
         statistical_sentences(closed.fitted, replace(closed.account, skew=skew)) for skew in (None, biased)
     )
     assert any(text.startswith("A time skew between currents and positions is not known") for text in unknown)
-    assert any("0.04 ± 0.06 ms, which may be zero" in text for text in unconfirmed)
+    assert any(
+        text.endswith("is not confirmed: instruments from the demanded motion give 0.04 ± 0.06 ms.")
+        for text in unconfirmed
+    )
 
 
 @dataclass(frozen=True)
@@ -500,7 +503,7 @@ def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, colu
     for gain in calibration.gains:
         assert f"{gain.std_percent:.2f}" in screen.text
         assert f"{gain.change_percent:+.1f}" in screen.text
-    for statistics in ("Turn 1", "would have been detected", "Not added", "failed a check", "may have", "scales all"):
+    for statistics in ("Turn 1", "Detection limit", "Not added", "failed a check", "may have", "scales all"):
         assert statistics not in screen.text
 
 
@@ -540,7 +543,7 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed
         assert one.tolerance_std == pytest.approx(abs(one.per_kg) * 0.0459)
     verbose = residual_view(weighed, closed.account, calibration, verbose=True)
     sentences = [part.text for part in verbose if isinstance(part, Sentence)]
-    assert any("which is ± 1 % of every gain, not in σ" in one for one in sentences)
+    assert any("which is ± 1 % of every gain, not included in σ" in one for one in sentences)
     # The file has it, and one of an earlier version is read without.
     path = tmp_path / "calibration.yaml"
     save_calibration(calibration, path)
@@ -890,8 +893,8 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     one_sided = GearLoss(motoring_rows=0.9, motoring_torque=0.97, loss=0.01, loss_std=0.04)
     both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
     text = next(_gear_sentence("J3", one_sided, in_model=False))
-    assert text.startswith("The gain of J3 carries the efficiency of its gear: the motor drives in 97 %")
-    assert "loss of up to 8.0 % would not show; it would change the gain by 7.5 %" in text
+    assert text.startswith("The gain of J3 includes the efficiency of its gear: the motor drives in 97 %")
+    assert "loss of up to 8.0 % would not show, and would change the gain by 7.5 %" in text
     assert not list(_gear_sentence("J3", both, in_model=False))
     found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
     assert "efficiency of 81.6 %" in next(_gear_sentence("J3", found, in_model=True))
