@@ -16,8 +16,7 @@ from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, p
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.controller import controller_faults
 from daq.config.hold import mimic_faults
-from daq.config.policy import max_change_faults
-from daq.config.signers import signer_faults
+from daq.config.policy import max_change_faults, signer_faults
 from daq.config.workspace import clearance_faults
 from daq.config.yaml_file import Document, Fault, Location, fault_texts
 from daq.errors import ConfigurationInconsistent
