@@ -16,8 +16,7 @@ from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused
 from daq.files import sha256
 from daq.ledger.fold import Event, WriteAction
-from daq.ledger.ledger import MAY_LACK
-from daq.ledger.standing import StandingState
+from daq.ledger.ledger import MAY_LACK, StandingState
 from daq.report.comparison import OPERATORS, Comparison, before_write, changes_from
 from daq.report.document import Figure, Report
 from daq.report.effect_names import accepted_text, size_text
