@@ -7,7 +7,6 @@ without a rounding error of its own: raw = round(value / count).
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
@@ -28,6 +27,7 @@ from daq.config.import_description import (
     load_import,
 )
 from daq.errors import ConfigurationInconsistent, TableUnfit
+from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
 from daq.log.container import MAGIC
@@ -130,7 +130,7 @@ def import_recording(
     slow = _slow(wanted, cell, files, clock, rate_hz)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)
     run = RunInfo(
-        run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
+        run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
         rate_hz=rate_hz,
         payload=_payload(wanted, cell),
         operator=wanted.operator,
