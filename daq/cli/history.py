@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -23,6 +22,7 @@ from daq.errors import (
     UsageError,
     evidence,
 )
+from daq.files import sha256
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -245,7 +245,7 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
     before = verify_ledger(ledger).unknown
-    new = enter_calibration(ledger, calibration, digest=hashlib.sha256(content).hexdigest(), who=who, at=now)
+    new = enter_calibration(ledger, calibration, digest=sha256(content), who=who, at=now)
     say(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
     checked = verify_ledger(ledger, _session_heads(ledger.cell))

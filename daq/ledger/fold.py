@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any
 from daq.config.cell import Cell
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
+from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
 from ident.calibration import Calibration, Gain, Source
 
@@ -96,7 +96,7 @@ def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
 def logs_of(calibration: Calibration, digest: str) -> str:
     """Return the digest of the set of logs of a fit; that of the calibration itself without logs."""
     logs = sorted({one.sha256 for one in _fitted(calibration)})
-    return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
+    return sha256("\n".join(logs).encode()) if logs else digest
 
 
 def _fitted(calibration: Calibration) -> list[Source]:

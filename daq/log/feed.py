@@ -9,7 +9,6 @@ file and end with the process. Only processes of the same user, or of root, are 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import selectors
@@ -30,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from daq.files import sha256
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
 from drivers.errors import POWERED, WHILE, stop_notes, text_of
@@ -170,7 +170,7 @@ class SocketNames:
 
 def socket_names(cell_file: Path) -> SocketNames:
     """Return the addresses for a cell file."""
-    digest = hashlib.sha256(str(cell_file.resolve()).encode()).hexdigest()[:24]
+    digest = sha256(str(cell_file.resolve()).encode())[:24]
     return SocketNames(*(f"\0drivegain-{digest}-{name}" for name in ("feed", "stop", "monitor")))
 
 

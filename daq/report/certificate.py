@@ -5,25 +5,30 @@ The judgement is that of `drivegain apply`: the same gates, and the same test fo
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from enum import Enum
+from pathlib import Path
 from typing import Literal
 
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused
 from daq.files import sha256
-from daq.ledger.fold import Event
-from daq.report.certificate_status import CertificateStatus, certificate_status, write_text
+from daq.ledger.fold import Event, WriteAction
+from daq.ledger.ledger import MAY_LACK, StandingState
 from daq.report.comparison import OPERATORS, Comparison, before_write, changes_from
 from daq.report.document import Figure, Report
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import Errors
-from daq.report.identity import identity
+from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import Refused
+from daq.report.text import minute_text
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
+from ident.data.run import Recording
 
 
 class CertifiedGain(Report):
@@ -67,6 +72,36 @@ class EarlierCalibration(Report):
     created: str
     axes: list[CertifiedGain]
     holdout_error_percent: Errors | None
+
+
+class StatusEvent(Report):
+    """A write, a rollback or an acceptance."""
+
+    at: str
+    who: str
+
+
+class StatusWrite(StatusEvent):
+    """A write, or a rollback that restored these gains."""
+
+    target: str
+    """the controller's file, or the drives"""
+
+
+class CertificateStatus(Report):
+    """State of a calibration by the audit log of its cell, and by the controller's file where it was read."""
+
+    state: str
+    """written, accepted, replaced, not written, or not known"""
+    text: str
+    """the same as a sentence"""
+    as_of: str | None
+    """when the audit log was read; null where it was not"""
+    write: StatusWrite | None
+    """last write of these gains; null where there was none"""
+    ended: StatusEvent | None
+    """write or rollback that put other gains in their place; null where there was none"""
+    acceptance: StatusEvent | None
 
 
 class CertificateReport(Report):
@@ -366,3 +401,114 @@ def _certified_gain(row: AxisRow) -> CertifiedGain:
         change_sigmas=row.judged.sigmas,
         verdict=row.words,
     )
+
+
+_VERBS = {WriteAction.APPLIED: "written", WriteAction.ROLLED_BACK: "restored by a rollback"}
+_ENDS = {WriteAction.APPLIED: "replaced by other gains", WriteAction.ROLLED_BACK: "rolled back"}
+
+
+def certificate_status(comparison: Comparison) -> CertificateStatus:
+    """Return the status for the document of the certificate."""
+    return CertificateStatus.of(comparison.standing, state=_state(comparison).value, text=status_text(comparison))
+
+
+def _state(comparison: Comparison) -> StandingState:
+    if comparison.changed_by_hand:
+        return StandingState.REPLACED
+    return comparison.standing.state
+
+
+def status_text(comparison: Comparison) -> str:
+    """Return the status in words."""
+    standing = comparison.standing
+    if standing.as_of is None:
+        return f"not known: {standing.unknown}"
+    parts = ["not written"]
+    if standing.write is not None:
+        parts = [write_text(standing.write)]
+    if standing.ended is not None:
+        parts.append(f"{_ENDS[standing.ended.action]} on {_when(standing.ended.at)} by {standing.ended.who}")
+    elif comparison.changed_by_hand:
+        parts.append("the file has other gains now")
+    if standing.acceptance is not None:
+        parts.append(f"accepted on {_when(standing.acceptance.at)} by {standing.acceptance.who}")
+    if standing.history.may_lack:
+        parts.append(MAY_LACK)
+    return f"{'; '.join(parts)} (as of {_when(standing.as_of)})"
+
+
+def write_text(write: Event) -> str:
+    """Say when a write was made, by whom and where."""
+    place = "the drives"
+    target = Path(write.target)
+    if target.is_absolute():
+        place = target.name
+    return f"{_VERBS[write.action]} on {_when(write.at)} by {write.who} to {place}"
+
+
+def _when(at: datetime) -> str:
+    return minute_text(at.isoformat())
+
+
+def identity(calibration: Calibration) -> dict[str, str]:
+    """Drives, operator, payload, dates, encoders and software as texts by their names; what is missing is said.
+
+    Encoders are there where the robot has more of them than degrees of freedom.
+    """
+    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+    operators = sorted({one.operator for one in recordings if one.operator})
+    payloads = "; ".join(payload_texts(calibration))
+    if payloads and not calibration.gains_fixed:
+        # No residual shows a wrong mass: it must be on the sheet that a person signs.
+        influences = "; ".join(mass_texts(calibration.payload_mass))
+        # Calibrations of earlier versions do not say more.
+        known = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
+        payloads = f"{payloads}; {known}"
+    names = {
+        "Serial numbers": _serials(calibration, recordings),
+        "Operator": ", ".join(operators) or "not known: the recordings name none",
+        "Payload": payloads or "none: every run was recorded without load",
+        "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
+    }
+    if calibration.encoder_misfit is not None:
+        names["Encoders"] = encoder_text(calibration.encoder_misfit)
+    names["Fitted"] = f"{minute_text(calibration.created)}, {calibration.software or 'software not known'}"
+    return names
+
+
+def payload_texts(calibration: Calibration) -> Iterator[str]:
+    """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
+    mounted: dict[tuple[str, float | None], list[float]] = {}
+    for source in calibration.sources:
+        if source.payload is not None:
+            entered = None if source.recording is None else source.recording.entered_kg
+            masses = mounted.setdefault((source.payload, source.mass_kg), [])
+            if entered is not None and entered not in masses:
+                masses.append(entered)
+    for (name, declared), masses in mounted.items():
+        entry = "no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file"
+        scale = "not weighed a second time"
+        if masses:
+            scale = f"{' and '.join(f'{one:g}' for one in masses)} kg on the scale"
+        yield f"{name}: {entry}, {scale}"
+
+
+def _period(times_s: Sequence[float]) -> str:
+    """Write the time between the first and the last recording to the minute, in UTC."""
+    if not times_s:
+        return "not known: the logs have no time of day"
+    first, last = (datetime.fromtimestamp(one, UTC).strftime("%Y-%m-%d %H:%M") for one in (min(times_s), max(times_s)))
+    if first == last:
+        return f"{first} UTC"
+    same_day = first[:10] == last[:10]
+    return f"{first} to {last[11:] if same_day else last} UTC"
+
+
+def _serials(calibration: Calibration, recordings: Sequence[Recording]) -> str:
+    found = []
+    for index, gain in enumerate(calibration.gains):
+        serials = dict.fromkeys(one.serials[index] for one in recordings if index < len(one.serials))
+        known = [str(serial) for serial in serials if serial is not None]
+        if known:
+            found.append(f"{gain.axis} {' and '.join(known)}")
+    return ", ".join(found) or "not known: the drives reported none"

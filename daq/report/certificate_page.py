@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from daq.report.certificate import AxisRow, Certificate, Verdict
-from daq.report.certificate_status import status_text
+from daq.report.certificate import AxisRow, Certificate, Verdict, identity, status_text
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import MASS_HEADINGS, mass_rows, value_rows, warning_texts, with_deviation
 from daq.report.html import (
@@ -26,7 +25,6 @@ from daq.report.html import (
     table,
     terms,
 )
-from daq.report.identity import identity
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
 from daq.report.text import SHOWN_SIGMAS, percent_text

@@ -19,8 +19,7 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
 from daq.files import sha256
 from daq.ledger.fold import Event
-from daq.ledger.ledger import Ledger
-from daq.ledger.standing import Standing, read_standing
+from daq.ledger.ledger import Ledger, Standing, read_standing
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates

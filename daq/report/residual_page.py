@@ -9,7 +9,7 @@ from pathlib import Path
 
 from daq.errors import writing
 from daq.files import replace_file
-from daq.ledger.standing import Standing
+from daq.ledger.ledger import Standing
 from daq.report.certificate import Origin, certify
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import Comparison, without_controller

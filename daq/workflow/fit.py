@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from daq.config.policy import DEFAULT_APPLY_POLICY
 from daq.config.yaml_file import Fault
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
+from daq.files import sha256
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.diagnoses import (
@@ -183,7 +183,7 @@ class Reading:
                 )
             self._corrections.note(log, run)
             # By its samples: a file that was rewritten is the same recording still.
-            content = hashlib.sha256(run.position_rad.tobytes() + run.current_a.tobytes()).hexdigest()
+            content = sha256(run.position_rad.tobytes() + run.current_a.tobytes())
             if content in self._seen:
                 raise LogRepeated(
                     str(log),

@@ -20,8 +20,7 @@ from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
-from daq.config.document_kind import DocumentKind
-from daq.config.yaml_file import StrictModel
+from daq.config.yaml_file import DocumentKind, StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.fold import drives_of

@@ -16,7 +16,7 @@ from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, UsageError
 from daq.jobs.context import Tools
 from daq.jobs.reporting import Conclusion
-from daq.ledger.standing import StandingState
+from daq.ledger.ledger import StandingState
 from daq.report.comparison import Comparison
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.simulation.cell import SimulatedCell

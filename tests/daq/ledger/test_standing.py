@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, append, read
-from daq.ledger.ledger import Ledger, record_session
-from daq.ledger.standing import Standing, StandingState, read_standing
+from daq.ledger.ledger import Ledger, Standing, StandingState, read_standing, record_session
 from tests.daq.histories import BEGIN, calibration_of, enter, ledger_in, write
 
 NOW = BEGIN + timedelta(days=400)
