@@ -95,9 +95,9 @@ class WatchedGain(StrictModel):
 
 
 class SessionState(StrictModel):
-    """`state.json`; results of steps that are not done yet are None or missing from the list."""
+    """What all sessions share; results of steps that are not done yet are None or missing from the list."""
 
-    format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
+    format: str  #: kind of session
     version: Literal[1] = 1
     session: str
     cell: str
@@ -127,6 +127,12 @@ class SessionState(StrictModel):
         return self.model_copy(update=changed)
 
 
+class JobState(SessionState):
+    """`state.json` of a scheduled job."""
+
+    format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
+
+
 class Block(StrictModel):
     """A run of a guided session, as it was decided before it was recorded."""
 
@@ -145,6 +151,7 @@ class GainSoFar(StrictModel):
     value: float
     std_percent: float
     target_percent: float
+    cause: str = ""  #: why it takes long; empty where it is not known
 
     @property
     def is_precise(self) -> bool:
@@ -157,6 +164,7 @@ class Progress(StrictModel):
 
     blocks: _Count
     motion_s: float  #: of these blocks
+    fitted_s: float = 0.0  #: of those that are not held out
     std_percent: tuple[float, ...]  #: of each gain
 
 
@@ -183,7 +191,7 @@ class Acceptance(StrictModel):
 class GuidedState(SessionState):
     """`state.json` of a guided session."""
 
-    format: Literal["drivegain-session"] = "drivegain-session"  # type: ignore[assignment]  # another kind of session
+    format: Literal["drivegain-session"] = "drivegain-session"
     blocks: tuple[Block, ...] = ()
     mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
     rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
@@ -194,6 +202,7 @@ class GuidedState(SessionState):
     repeated: tuple[str, ...] = ()  #: names of blocks that were recorded again because of a mistake, once each time
     complete: bool = False  #: nothing is left to record
     missing: str = ""  #: what was not reached when the recording ended, in words
+    would_help: tuple[str, ...] = ()  #: what would help to reach it, a sentence each
     acceptance: Acceptance | None = None
 
     @property

@@ -24,9 +24,11 @@ from daq.jobs.operator import Operator
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
 from daq.report.plan_preview import save_preview
+from daq.workflow.choices import LARGEST_STD_PERCENT
+from daq.workflow.experiment import Experiment
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
-from daq.workflow.plan import Plan, plan
+from daq.workflow.plan import Plan, PlanGoal, TargetBox, plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
 from daq.workflow.validate import Validation, validate
@@ -151,7 +153,20 @@ def _refused(axis: Axis, statusword: int, remedy: str) -> StateRefused:
 class Planner(Protocol):
     """Makes a plan of a cell."""
 
-    def __call__(self, cell: Cell, *, seed: int, duration_s: float) -> Plan:
+    def __call__(
+        self,
+        cell: Cell,
+        /,
+        *,
+        seed: int,
+        duration_s: float,
+        speed: float = 1.0,
+        largest_condition: float | None = None,
+        largest_std_percent: float = LARGEST_STD_PERCENT,
+        experiment: Experiment | None = None,
+        goal: PlanGoal | None = None,
+        box: TargetBox | None = None,
+    ) -> Plan:
         """As `daq.workflow.plan.plan`."""
 
 

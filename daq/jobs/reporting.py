@@ -242,6 +242,8 @@ def _guided_lines(state: GuidedState) -> list[str]:
     lines: list[str] = []
     if state.missing:
         lines += ["", f"Not reached: {state.missing}"]
+    if state.would_help:
+        lines += ["What would help:", *(f"  {line}" for line in state.would_help)]
     if state.acceptance is not None:
         verdict = "Accepted" if state.acceptance.accepted else "NOT ACCEPTED"
         lines += ["", f"{verdict} on new moves: {state.acceptance.remark}."]

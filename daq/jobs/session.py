@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from daq.documents.session_state import GuidedState, SessionState
+from daq.documents.session_state import GuidedState, JobState, SessionState
 from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
@@ -24,7 +24,7 @@ STATE = "state.json"
 CALIBRATION = "calibration.yaml"
 REPORT = "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
-_ANY_STATE: TypeAdapter[SessionState | GuidedState] = TypeAdapter(SessionState | GuidedState)
+_ANY_STATE: TypeAdapter[JobState | GuidedState] = TypeAdapter(JobState | GuidedState)
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 _REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
@@ -113,7 +113,7 @@ class Basis:
     plans_sha256: str
 
 
-def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = SessionState) -> Session:
+def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = JobState) -> Session:
     """Begin a session: make its folder and write its state.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from daq.documents.calibration_file import EffectEntry
-from daq.documents.session_state import GuidedState, Outcome, SessionState
+from daq.documents.session_state import GuidedState, JobState, Outcome
 from daq.report.document import Figure, Report
 
 
@@ -108,7 +108,7 @@ class ConcludedJob(RefusedJob):
     folder: str
 
 
-class JobReport(SessionState, ConcludedJob):
+class JobReport(JobState, ConcludedJob):
     """`recalibrate`: what is left to do, and the state of its session."""
 
     # Keys of the base that is named last come first.

@@ -21,7 +21,7 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun
 from daq.documents.calibration_file import EffectEntry, as_document
-from daq.documents.session_state import SessionState
+from daq.documents.session_state import JobState
 from daq.environment import shipped_configurations
 from daq.errors import CalibrationRefused, UsageError
 from daq.files import replace_file
@@ -206,9 +206,7 @@ class DemoStages:
             Journal(StringIO(), Form.TEXT, self._now),
         )
         at = self._now().isoformat(timespec="seconds")
-        state = SessionState(
-            session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at
-        )
+        state = JobState(session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at)
         with suppress(CalibrationRefused):
             run_stages(TO_DECISION, context, save(Session(out, state)))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -11,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -40,16 +42,19 @@ from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, mista
 from daq.jobs.context import Tools
 from daq.jobs.guided import FIRST_BLOCKS, NEXT_BLOCKS, BlockRole, role_of
 from daq.jobs.operator import GivenAnswers
+from daq.jobs.reporting import Conclusion, ending
 from daq.jobs.session import Session
 from daq.jobs.stages import Decide, Identify, Record, Stage, WatchDrift
 from daq.ledger.audit import AuditAction
+from daq.report.plan_preview import save_preview
 from daq.simulation import demo
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.bus_lock import bus_lock
+from daq.workflow.plan import Plan, load_plan, plan
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from tests.daq.histories import history_of
-from tests.daq.jobs.made_session import MASS_KG, MadeSession, given_answers, made_session_rig, run_session
+from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, Rig, serving
 
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now"})
@@ -450,6 +455,125 @@ def test_job_session_and_demonstration_take_the_same_stages(
     assert of_demo is of_job
     assert of_session[:-1] == of_job
     assert type(of_session[-1]) is Accept
+
+
+# Blocks for the worst gain
+
+
+def aimed_rig(folder: Path, made: MadeSession, planned: list[dict[str, Any]]) -> Rig:
+    """A session whose gains are never precise: later blocks are copies of the first ones, with plans of their own."""
+    rig = made_session_rig(folder, made)
+    tools = rig.tools
+
+    def plan_later(cell: Cell, *, seed: int, duration_s: float, **further: Any) -> Plan:
+        if not further:
+            return made.plans[seed]
+        planned.append(further)
+        return plan(cell, seed=seed, duration_s=duration_s, exchanges=24, **further)
+
+    def record_later(request: RecordingRequest, **further: Any) -> Recorded:
+        known = {"block-4-loaded": "block-2-loaded", "block-5-bare": "block-1-bare"}
+        name = known.get(request.out.stem)
+        if name is None:
+            recorded: Recorded = tools.record(request, **further)
+            return recorded
+        # The same content, which the calibration that was made names as its source.
+        request.out.write_bytes(request.out.with_name(f"{name}.mcap").read_bytes())
+        return replace(made.recorded[name], path=request.out)
+
+    rig.tools = replace(tools, plan=plan_later, record=record_later, preview=save_preview)
+    return rig
+
+
+@pytest.fixture(scope="module")
+def aimed_session(
+    tmp_path_factory: pytest.TempPathFactory, made_session: MadeSession
+) -> tuple[Rig, list[dict[str, Any]], Conclusion]:
+    """A session of five blocks, at whose end the time is up."""
+    planned: list[dict[str, Any]] = []
+    rig = aimed_rig(tmp_path_factory.mktemp("aimed") / "cell", made_session, planned)
+    ended = run_session(rig, target_percent=0.05, time_limit_min=5 * BLOCK_S / 60.0)
+    return rig, planned, ended
+
+
+def test_from_the_fourth_block_on_moves_are_for_the_worst_gain(
+    aimed_session: tuple[Rig, list[dict[str, Any]], Conclusion],
+) -> None:
+    rig, planned, _ = aimed_session
+    state = state_of(rig)
+    assert [block.name for block in state.blocks][3:] == ["block-4-loaded", "block-5-bare"]
+    assert [further["experiment"].mounted for further in planned] == [(0,), (None,)]
+    for further in planned:
+        goal = further["goal"]
+        design = further["experiment"].design
+        # By the plan's own ratio the worst gain is that of the last estimate.
+        ratio = goal.ratio(design.std_percent(goal.recorded))
+        estimated = [gain.std_percent / gain.target_percent for gain in state.gains]
+        assert ratio.tolist() == pytest.approx(estimated)
+    worst = max(state.gains, key=lambda gain: gain.std_percent)
+    page = (rig.session.folder / "plan-4.html").read_text()
+    assert f"Planned for the gain that is farthest from its target after 3 blocks: {worst.axis}," in page
+    assert "Planned for" not in (rig.session.folder / "plan-1.html").read_text()
+    assert all(gain.cause for gain in state.gains)
+
+
+def test_later_blocks_stay_where_the_accepted_ones_were(
+    aimed_session: tuple[Rig, list[dict[str, Any]], Conclusion],
+) -> None:
+    rig, _, _ = aimed_session
+    plans = [load_plan(rig.session.folder / f"plan-{number}.yaml", rig.cell) for number in (1, 2, 3, 4, 5)]
+    accepted = [move for one in plans[:3] for move in one.moves]
+    lower = np.min([move.target_rad for move in accepted], axis=0) - 2e-5
+    upper = np.max([move.target_rad for move in accepted], axis=0) + 2e-5
+    for move in (move for one in plans[3:] for move in one.moves):
+        assert (np.array(move.target_rad) >= lower).all()
+        assert (np.array(move.target_rad) <= upper).all()
+        assert move.velocity <= max(other.velocity for other in accepted)
+        assert move.acceleration <= max(other.acceleration for other in accepted)
+
+
+def test_at_the_time_limit_it_says_what_is_missing_and_what_would_help(
+    aimed_session: tuple[Rig, list[dict[str, Any]], Conclusion],
+) -> None:
+    rig, _, ended = aimed_session
+    state = state_of(rig)
+    assert state.complete
+    assert "the target is 0.05 %" in state.missing
+    more_time, *by_axis = state.would_help
+    assert "--time-limit" in more_time
+    assert [line.split(":")[0] for line in by_axis] == [gain.axis for gain in state.gains]
+    assert [event["would_help"] for event in rig.events if event["event"] == "time is up"] == [list(state.would_help)]
+    said = ending(ended, rig.cell_file)
+    assert "What would help:" in said
+    assert more_time in said
+    # σ falls as 1/√time of the blocks that are in the fit.
+    worst = max(gain.std_percent / gain.target_percent for gain in state.gains)
+    assert state.progress[-1].fitted_s == 4 * BLOCK_S
+    needed_s = 5 * BLOCK_S + 4 * BLOCK_S * (worst**2 - 1.0)
+    assert f"--time-limit {math.ceil(needed_s / 60.0)})" in more_time
+
+
+def test_a_damaged_plan_for_the_worst_gain_is_made_again_in_the_same_room(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    planned: list[dict[str, Any]] = []
+    rig = aimed_rig(tmp_path / "cell", made_session, planned)
+
+    def stop_before(payload: str | None) -> None:
+        if len(rig.session.state.runs) == len(FIRST_BLOCKS):
+            raise KeyboardInterrupt
+
+    limits: dict[str, Any] = {"target_percent": 0.05, "time_limit_min": 4 * BLOCK_S / 60.0}
+    with pytest.raises(KeyboardInterrupt):
+        run_session(rig, given_answers(rig, put=stop_before), **limits)
+    (rig.session.folder / "plan-4.yaml").write_text("damaged")
+    rig.clock.go_on(minutes=5)
+    run_session(rig, **limits)
+    aimed, again = planned
+    assert "goal" in aimed
+    assert "goal" not in again
+    assert again["box"].lower.tolist() == aimed["box"].lower.tolist()
+    assert again["speed"] == aimed["speed"]
 
 
 # Mistakes in a block

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from daq.jobs.journal import Form, Level
 from daq.jobs.position import StageName, position_of
 from daq.jobs.session import Session, save
 from daq.jobs.story import PARAGRAPHS, SENTENCES, Story
+from daq.log.feed import QuickGain, QuickLook
 from tests.daq.jobs.made_session import MadeSession, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, Rig
 
@@ -45,7 +47,50 @@ def test_the_worst_gain_comes_first_with_what_it_lacks() -> None:
     assert title == "Gains after 3 blocks, 60 s of motion:"
     assert worst.split() == ["J6", "6.79", "Nm/A", "±", "1.00", "%", "not", "yet:", "2.0", "×", "the", "target"]
     assert other.split() == ["J1", "33.9", "Nm/A", "±", "0.40", "%", "✓"]
-    assert "J6 needs the longest: about 180 s more" in outlook
+    assert "J6 needs the longest: about 3 min more at this rate" in outlook
+
+
+def test_why_the_worst_gain_is_worst_is_said_after_a_block() -> None:
+    journal, stream = story()
+    explained = ({**GAINS[0], "cause": ""}, {**GAINS[1], "cause": "its current is noisier than planned"})
+    journal.say(Level.INFO, "gains so far", gains=list(explained), blocks=3, motion_s=60.0, left_s=100.0)
+    outlook = stream.getvalue().strip().splitlines()[-1]
+    assert "J6 needs the longest (its current is noisier than planned): about 100 s more" in outlook
+
+
+def quick(**changed: object) -> str:
+    """What a person reads of a look after a move."""
+    gains = [QuickGain("J6", "Nm/A", 6.79, 1.0, 0.5), QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)]
+    look = QuickLook("block-4-loaded", 3, 14, 80.0, gains=gains, why="it needs more moves", left_s=240.0)
+    journal, stream = story()
+    journal.say(Level.INFO, "quick estimate", **asdict(replace(look, **changed)))  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def test_after_a_move_one_line_has_every_gain_beside_its_target() -> None:
+    (line,) = quick().splitlines()
+    assert line.startswith("Quick estimate after move 3 of 14")
+    assert "J6 6.79 Nm/A ± 1.00 % (0.5 %), J1 33.9 Nm/A ± 0.40 % (0.5 %)" in line
+    assert line.endswith("J6 is worst (it needs more moves): about 4 min left at this rate.")
+
+
+def test_what_is_missing_is_said_in_the_place_of_figures() -> None:
+    assert quick(gains=[], missing="no payload") == "No gains yet: no payload.\n"
+    held_out = quick(is_held_out=True)
+    assert held_out.startswith("This block is held out: its moves do not count.")
+    assert "left at this rate" not in held_out
+    assert "the estimate at the end of the block decides" in quick(left_s=0.0)
+
+
+def test_at_the_time_limit_it_is_said_what_would_help() -> None:
+    journal, stream = story()
+    journal.say(Level.NOTICE, "time is up", missing="J6 1.02 %", would_help=("more time", "J6: mount a heavier body"))
+    assert stream.getvalue().strip().splitlines() == [
+        "The time is up. Not reached: J6 1.02 %.",
+        "What would help:",
+        "  more time",
+        "  J6: mount a heavier body",
+    ]
 
 
 def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
@@ -78,7 +123,9 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     assert "Accepted" in text
     assert "kg more on the flange than without load" in text
     assert "2026-" not in "".join(line for line in text.splitlines() if "/" not in line)
-    assert set(PARAGRAPHS) <= {event["event"] for event in rig.events}
+    # A session that reaches its target has no end of its time, and looks after a move are not of the session itself.
+    elsewhere = {"quick estimate", "time is up"}
+    assert set(PARAGRAPHS) - elsewhere <= {event["event"] for event in rig.events}
     assert not set(PARAGRAPHS) & set(SENTENCES)
 
 
@@ -148,7 +195,9 @@ def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(
     assert precision["left_s"] == 0.0
     (progress,) = precision["progress"]
     assert progress["motion_s"] == 18.0
+    assert progress["fitted_s"] == 12.0
     assert len(progress["std_percent"]) == len(precision["axes"]) == 6
+    assert precision["worst"] in precision["axes"]
     assert shown["session"]["kind"] == "Session"
     waiting = state(runs=(_run("block-1-bare"),))
     folder = rig.session.folder

@@ -16,7 +16,7 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import encode_calibration, load_calibration, save_calibration
-from daq.documents.session_state import Fitted, SessionState
+from daq.documents.session_state import Fitted, JobState
 from daq.errors import CalibrationRefused, ExitCode
 from daq.files import sha256
 from daq.jobs.session import Session, save, session_of
@@ -450,7 +450,7 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
     save_calibration(demo_calibration(), file)
     digest = sha256(file.read_bytes())
     at = NOW.isoformat()
-    state = SessionState(
+    state = JobState(
         session=folder.name,
         cell="demo",
         configuration_sha256="c",
