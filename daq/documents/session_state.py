@@ -158,12 +158,12 @@ class Progress(StrictModel):
 
 
 class ScaleOfAxis(StrictModel):
-    """Measured over predicted torque of a joint on new moves: 1 where its gain is right."""
+    """Measured over predicted torque of a joint on new moves: 1 where its gain is right, None where it did not move."""
 
     axis: str
-    old: float  #: with the gain that the controller had
-    new: float  #: with the one that was written
-    std: float  #: σ of the new one
+    old: float | None  #: with the gain that the controller had
+    new: float | None  #: with the one that was written
+    std: float | None  #: σ of the new one
 
 
 class Acceptance(StrictModel):

@@ -19,10 +19,12 @@ from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
 from daq.jobs.block_check import BlockFacts, look_at_block
+from daq.jobs.certificate import renew_certificate
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
+from daq.report.certificate import Certificate
 from daq.report.plan_preview import save_preview
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
@@ -215,6 +217,7 @@ class Tools:
     propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
     apply: ChangeWriter = apply
     validate: Validator = validate
+    certify: Callable[[Path, Cell, Calibration, Path, datetime], Certificate] = renew_certificate
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
     now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone

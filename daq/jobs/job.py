@@ -22,7 +22,7 @@ from daq.jobs.operator import CellPolicy
 from daq.jobs.recording import FixedRuns, basis_of, calibration_of_session, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Session
-from daq.jobs.stages import TO_DECISION, run_stages
+from daq.jobs.stages import OF_JOB, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
@@ -66,7 +66,7 @@ def recalibrate(
                     with block_signals() as asked_again, in_time():
                         yield asked_again
 
-                session = run_stages(TO_DECISION, replace(context, block_signals=block_both), session)
+                session = run_stages(OF_JOB, replace(context, block_signals=block_both), session)
         except BaseException as error:
             report_failure(context, session.folder, error)
             raise

@@ -40,6 +40,19 @@ def on_flange(run: PlannedRun | Block) -> str:
     return f"{run.payload.upper()} ({run.mass_kg:g} kg) on the flange"
 
 
+def goes_on_with(state: GuidedState) -> str:
+    """Say what the same command does next in a session that an error has ended."""
+    recorded = {run.name for run in state.runs}
+    waiting = [block.name for block in state.blocks if block.name not in recorded]
+    if waiting:
+        return f"it records {waiting[0]} again, which does not count yet"
+    if not state.complete:
+        return "it goes on with the next block"
+    if state.outcome is Outcome.APPLIED:
+        return "it goes on with the moves that accept the gains, and writes nothing again"
+    return "it records nothing again, and goes on with the identification"
+
+
 def position_of(state: GuidedState) -> Position:
     """Find the stage that a session is in, by what its state has and lacks."""
     if state.outcome is not None and state.is_over:

@@ -19,6 +19,7 @@ from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import SessionContext
 from daq.jobs.journal import Level
+from daq.jobs.position import goes_on_with
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
@@ -110,15 +111,15 @@ def _report(
     except (AuditUnusable, OutputFailed) as error:
         context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
         unwritten = error
-    session = sessions.save(Session(session.folder, state))
+    session = Session(session.folder, state)
     conclusion = Conclusion(outcome, int(code), session, remark)
     level = Level.NOTICE if outcome.good else Level.ERROR
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
-    with writing(session.folder):
-        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        is_guided = isinstance(session.state, GuidedState)
-        report = session_report(conclusion, context.file) if is_guided else conclusion_report(conclusion, context.file)
-        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
+    try:
+        _write_summary(conclusion, session, context.file)
+    finally:
+        # Last: a session that is over has its summary, also after a kill.
+        sessions.save(session)
     found = sessions.sessions(context.settings.folder, context.cell.name)
     if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -133,6 +134,19 @@ def _report(
     if unwritten is not None:
         raise unwritten
     return conclusion
+
+
+def _write_summary(conclusion: Conclusion, session: Session, cell_file: Path) -> None:
+    """Write the summary as text and as JSON.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    is_guided = isinstance(session.state, GuidedState)
+    report = session_report(conclusion, cell_file) if is_guided else conclusion_report(conclusion, cell_file)
+    with writing(session.folder):
+        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, cell_file).encode())
+        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
 
 
 def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
@@ -248,10 +262,20 @@ def _guided_lines(state: GuidedState) -> list[str]:
     return lines
 
 
+def undo_command(cell_file: Path) -> str:
+    """Return the command that undoes a write to the controller's file."""
+    return f"drivegain rollback {shlex.quote(str(cell_file.absolute()))}"
+
+
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps for the operator, a line each."""
     session = conclusion.session
     outcome = conclusion.outcome
+    if outcome is Outcome.APPLIED and session is not None and _is_contradicted(session.state):
+        return [
+            f"undo the write: {undo_command(cell_file)}",
+            "compare the controller's numbers and the payload with the certificate, then calibrate again",
+        ]
     if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
         calibration = shlex.quote(str(session.folder / CALIBRATION))
         cell = shlex.quote(str(cell_file.absolute()))
@@ -265,14 +289,22 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
         return [
             "let the controller load the file",
-            f"to undo it: drivegain rollback {shlex.quote(str(cell_file.absolute()))}",
+            f"to undo it: {undo_command(cell_file)}",
         ]
+    is_to_go_on = outcome in (Outcome.STOPPED, Outcome.INTERRUPTED)
+    if is_to_go_on and session is not None and isinstance(session.state, GuidedState):
+        return [f"remove the cause, then start the same command: {goes_on_with(session.state)}"]
     return {
         Outcome.REFUSED: ["see which check failed; the next job records anew"],
         Outcome.UNFIT: ["see what is wrong with the recordings (`drivegain info LOG`); the next job records anew"],
         Outcome.STOPPED: ["remove the cause; the next job resumes this session while it is recent"],
         Outcome.INTERRUPTED: ["nothing, or run the job again: it resumes this session while it is recent"],
     }.get(outcome, ["nothing"])
+
+
+def _is_contradicted(state: SessionState) -> bool:
+    """Whether new moves contradict the gains that were written."""
+    return isinstance(state, GuidedState) and state.acceptance is not None and not state.acceptance.accepted
 
 
 PREFIX = "drivegain_recalibration_"

@@ -73,6 +73,7 @@ SESSIONS = frozenset(
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.RECALIBRATION_ENDED,
         AuditAction.ACCEPTED,
+        AuditAction.NOT_ACCEPTED,
     }
 )
 """What `record_session` enters."""

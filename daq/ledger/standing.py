@@ -1,4 +1,4 @@
-"""State of one calibration by the ledger of its cell: written, accepted, replaced, or none of it."""
+"""State of one calibration by the ledger of its cell: written, accepted or not, replaced, or none of it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import Enum
 
-from daq.ledger.audit import AuditAction, AuditEntry, begun_by, noted_heads, verify
-from daq.ledger.fold import Event, History, at_of, text_field
+from daq.ledger.audit import AuditEntry, begun_by, noted_heads, verify
+from daq.ledger.fold import Event, History, RecordedAcceptance
 from daq.ledger.ledger import Ledger, read_history
 
 
@@ -20,15 +20,8 @@ class StandingState(Enum):
     NOT_WRITTEN = "not written"
     WRITTEN = "written"  #: a controller has its gains
     ACCEPTED = "accepted"  #: it was tried in the cell, and accepted
+    NOT_ACCEPTED = "not accepted"  #: it was tried in the cell, and new moves contradict it
     REPLACED = "replaced"  #: its gains were written, and were replaced or rolled back since
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedAcceptance:
-    """An entry of the audit log that accepts a calibration."""
-
-    at: datetime  #: when, UTC
-    who: str  #: the person or the session
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +35,7 @@ class Standing:
     ended: Event | None = None
     #: Gains that were at that place before the write, by axis; empty where the ledger does not have them.
     before: Mapping[str, float] = field(default_factory=dict)
-    acceptance: RecordedAcceptance | None = None  #: the last one
+    acceptance: RecordedAcceptance | None = None  #: result of the last new moves with these gains
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
 
     @property
@@ -53,7 +46,7 @@ class Standing:
         if self.ended is not None:
             return StandingState.REPLACED
         if self.acceptance is not None:
-            return StandingState.ACCEPTED
+            return StandingState.ACCEPTED if self.acceptance.accepted else StandingState.NOT_ACCEPTED
         if self.write is not None:
             return StandingState.WRITTEN
         return StandingState.NOT_WRITTEN
@@ -76,6 +69,7 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
     # Entries that were edited prove nothing.
     entries = verify(ledger.audit, noted_heads(ledger.audit)).intact
     write = _last_write(history, digest, place)
+    acceptances = [one for one in history.acceptances if one.digest == digest]
     before: dict[str, float] = {}
     ended: Event | None = None
     if write is not None:
@@ -86,7 +80,7 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
         write=write,
         ended=ended,
         before=before,
-        acceptance=_last_acceptance(entries, ledger.cell.name, digest),
+        acceptance=acceptances[-1] if acceptances else None,
         history=history,
     )
 
@@ -127,13 +121,3 @@ def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, floa
         if isinstance(axis, str) and isinstance(old, float | int) and math.isfinite(old):
             before[axis] = float(old)
     return before
-
-
-def _last_acceptance(entries: Sequence[AuditEntry], cell: str, digest: str) -> RecordedAcceptance | None:
-    for entry in reversed(entries):
-        if entry.action is not AuditAction.ACCEPTED or text_field(entry, "cell") != cell:
-            continue
-        at = at_of(entry)
-        if at is not None and text_field(entry, "calibration_sha256") == digest:
-            return RecordedAcceptance(at, entry.who)
-    return None

@@ -227,6 +227,14 @@ class Certificate:
         return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
 
     @property
+    def contradicted(self) -> str:
+        """What new moves with the written gains have found wrong; empty where nothing is."""
+        acceptance = self.comparison.standing.acceptance
+        if acceptance is None or acceptance.accepted:
+            return ""
+        return acceptance.remark or "the audit log does not say how"
+
+    @property
     def _failed(self) -> list[Refusal]:
         """Failed checks that no operator can open."""
         return [refusal for refusal in self.comparison.refusals if refusal.gate not in OPERATORS]
@@ -246,6 +254,8 @@ class Certificate:
         sentence = f"{text[0].upper()}{text[1:]}"
         if any(row.significant for row in self.changed):
             sentence += f": {changed}"
+        if self.contradicted:
+            sentence += f". New moves contradict them: {self.contradicted}"
         if self._failed:
             sentence += f". Today a check refuses them: {self._reason}"
         return f"{sentence}."

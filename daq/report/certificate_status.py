@@ -1,11 +1,11 @@
-"""Status of a calibration on its certificate: written, accepted, replaced, or not written, with date and person."""
+"""Status of a calibration on its certificate: written, accepted or not, replaced, not written; date and person."""
 
 from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
 
-from daq.ledger.fold import Event, WriteAction
+from daq.ledger.fold import Event, RecordedAcceptance, WriteAction
 from daq.ledger.ledger import MAY_LACK
 from daq.ledger.standing import StandingState
 from daq.report.comparison import Comparison
@@ -17,7 +17,7 @@ _ENDS = {WriteAction.APPLIED: "replaced by other gains", WriteAction.ROLLED_BACK
 
 
 class StatusEvent(Report):
-    """A write, a rollback or an acceptance."""
+    """A write, a rollback, or new moves with the gains."""
 
     at: str
     who: str
@@ -30,11 +30,21 @@ class StatusWrite(StatusEvent):
     """the controller's file, or the drives"""
 
 
+class StatusAcceptance(StatusEvent):
+    """Result of new moves with these gains."""
+
+    accepted: bool
+    remark: str
+    """what was found"""
+    undo: str
+    """command that undoes the write; empty where they were accepted"""
+
+
 class CertificateStatus(Report):
     """State of a calibration by the audit log of its cell, and by the controller's file where it was read."""
 
     state: str
-    """written, accepted, replaced, not written, or not known"""
+    """written, accepted, not accepted, replaced, not written, or not known"""
     text: str
     """the same as a sentence"""
     as_of: str | None
@@ -43,7 +53,8 @@ class CertificateStatus(Report):
     """last write of these gains; null where there was none"""
     ended: StatusEvent | None
     """write or rollback that put other gains in their place; null where there was none"""
-    acceptance: StatusEvent | None
+    acceptance: StatusAcceptance | None
+    """result of the last new moves with these gains; null where there were none"""
 
 
 def certificate_status(comparison: Comparison) -> CertificateStatus:
@@ -70,10 +81,22 @@ def status_text(comparison: Comparison) -> str:
     elif comparison.changed_by_hand:
         parts.append("the file has other gains now")
     if standing.acceptance is not None:
-        parts.append(f"accepted on {_when(standing.acceptance.at)} by {standing.acceptance.who}")
+        parts.append(_acceptance_text(standing.acceptance, is_in_place=comparison.in_force is not None))
     if standing.history.may_lack:
         parts.append(MAY_LACK)
     return f"{'; '.join(parts)} (as of {_when(standing.as_of)})"
+
+
+def _acceptance_text(acceptance: RecordedAcceptance, *, is_in_place: bool) -> str:
+    """Say when new moves accepted the gains; otherwise what failed, and how to undo the write if it is in place."""
+    if acceptance.accepted:
+        return f"accepted on {_when(acceptance.at)} by {acceptance.who}"
+    text = f"NOT ACCEPTED on {_when(acceptance.at)} by {acceptance.who}"
+    if acceptance.remark:
+        text += f": {acceptance.remark}"
+    if is_in_place and acceptance.undo:
+        text += f"; to undo the write: {acceptance.undo}"
+    return text
 
 
 def write_text(write: Event) -> str:
