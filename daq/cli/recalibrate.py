@@ -115,12 +115,13 @@ def schedule_verb(
     The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
     name of this verb, `install-units`, goes on working.
     """
-    from daq.jobs.context import section_of, target_of
+    from daq.jobs.context import section_of
+    from daq.jobs.gain_target import file_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
     declared = read_cell(cell)
     section = section_of(declared)
-    target_of(declared)  # refuses a cell without a controller file
+    file_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()
     try:
         owner = place.owner()

@@ -82,6 +82,7 @@ class PlannedWrite(StrictModel):
     after_sha256: str
     looked_at: str = ""  #: value for `apply --base`
     unsigned: bool = False  #: required signatures are missing
+    in_drives: bool = False  #: into the drives, not into a file
 
 
 class WatchedGain(StrictModel):
@@ -116,8 +117,15 @@ class SessionState(StrictModel):
 
     @property
     def is_over(self) -> bool:
-        """Whether no command goes on with it; a command that was killed before it reported its end did not end it."""
-        return self.outcome is not None and self.outcome.concluded and self.ended is not None
+        """Whether no command goes on with it.
+
+        A command that was killed before it reported its end did not end it; nor did one that an error ended behind the
+        decision, before the certificate had it.
+        """
+        if self.outcome is None or self.ended is None:
+            return False
+        is_cut_short = self.outcome.good and bool(self.problem)
+        return self.outcome.concluded and not is_cut_short
 
     def with_(self, **changed: object) -> SessionState:
         """A copy with other values."""
@@ -171,8 +179,8 @@ class Acceptance(StrictModel):
 
     log_sha256: str
     scales: tuple[ScaleOfAxis, ...]
-    old_error_percent: float  #: of all axes
-    new_error_percent: float
+    old_error_percent: float | None  #: of all axes; None where it is no number
+    new_error_percent: float | None
     accepted: bool
     remark: str
 

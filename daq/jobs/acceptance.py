@@ -9,6 +9,7 @@ import numpy as np
 
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis
+from daq.errors import ControllerChanged
 from daq.files import sha256_of
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.guided import guided, plan_moves, require_same_cell
@@ -55,6 +56,7 @@ class Accept:
         """Make the run, and judge it."""
         before_motion(context)  # the command may have been started again for this run alone
         require_same_cell(context)
+        _require_written(context, session)
         last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
         seed = context.settings.seed + SEED_STEP
@@ -63,6 +65,28 @@ class Accept:
         context.operator.mount(planned)
         record_valid(context, session, NextRun(planned, plan))
         return judge_acceptance(context, session)
+
+
+def _require_written(context: SessionContext, session: Session) -> None:
+    """Read the gains back from the drives before anything moves; a file is compared when it is written.
+
+    Raises:
+        ControllerChanged: the drives have other values than those that were written.
+        DriverError: a drive does not answer.
+    """
+    planned = session.state.target
+    if planned is None or not planned.in_drives:
+        return
+    found = context.content_sha256(calibration_made(session))
+    if found != planned.after_sha256:
+        raise ControllerChanged(
+            context.target.subject,
+            found="other values than those that this session wrote",
+            expected="the written gains, read back before the moves that accept them",
+            remedy="nothing has moved; see whether the drives lost power before they saved, or were written since "
+            "(`drivegain history`), and write them again with `drivegain apply --drives`",
+        )
+    context.journal.say(Level.INFO, "the gains were read back from the drives")
 
 
 def _enter(context: SessionContext, session: Session) -> None:
@@ -74,7 +98,7 @@ def _enter(context: SessionContext, session: Session) -> None:
     if any(one.log_sha256 == acceptance.log_sha256 for one in known):
         return
     digest = sha256_of(session.folder / CALIBRATION)
-    details = {
+    details: dict[str, object] = {
         "calibration_sha256": digest,
         "log_sha256": acceptance.log_sha256,
         "old_error_percent": acceptance.old_error_percent,
@@ -86,7 +110,7 @@ def _enter(context: SessionContext, session: Session) -> None:
         audit_entry(context, AuditAction.ACCEPTED, session, details)
         context.journal.say(Level.NOTICE, "accepted", text=acceptance.remark)
         return
-    undo = undo_command(context.file)
+    undo = undo_command(context.file, in_drives=context.target.in_drives)
     audit_entry(context, AuditAction.NOT_ACCEPTED, session, {**details, "undo": undo})
     context.journal.say(Level.ERROR, "not accepted", text=acceptance.remark, undo=undo)
 
@@ -115,8 +139,8 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     return Acceptance(
         log_sha256=sha256_of(log_of(session, RUN)) or "",
         scales=scales,
-        old_error_percent=before.error.total,
-        new_error_percent=after.error.total,
+        old_error_percent=_finite(before.error.total),
+        new_error_percent=_finite(after.error.total),
         accepted=not off,
         remark=remark,
     )

@@ -14,7 +14,8 @@ from daq.documents.session_state import GuidedState
 from daq.errors import ConfigurationInconsistent, DaqError
 from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, target_of
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
+from daq.jobs.gain_target import target_of
 from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator

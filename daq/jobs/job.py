@@ -16,7 +16,8 @@ from daq.config.recalibration import Recalibration
 from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, TimeBoundReached
 from daq.jobs import session as sessions
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of, target_of
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of
+from daq.jobs.gain_target import file_of
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import CellPolicy
 from daq.jobs.recording import FixedRuns, basis_of, calibration_of_session, verified_runs
@@ -120,7 +121,7 @@ def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: s
         section,
         FixedRuns(section.runs),
         CellPolicy(cell, section, who, tools.run),
-        target_of(cell),
+        file_of(cell),
         tools,
         journal,
         began_s=tools.monotonic_s(),

@@ -262,35 +262,41 @@ def _guided_lines(state: GuidedState) -> list[str]:
     return lines
 
 
-def undo_command(cell_file: Path) -> str:
-    """Return the command that undoes a write to the controller's file."""
-    return f"drivegain rollback {shlex.quote(str(cell_file.absolute()))}"
+def undo_command(cell_file: Path, *, in_drives: bool) -> str:
+    """Return the command that undoes a write to the controller's file, or to the drives."""
+    command = f"drivegain rollback {shlex.quote(str(cell_file.absolute()))}"
+    if in_drives:
+        command += " --drives --yes"
+    return command
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps for the operator, a line each."""
     session = conclusion.session
     outcome = conclusion.outcome
+    target = None if session is None else session.state.target
+    undo = undo_command(cell_file, in_drives=target is not None and target.in_drives)
     if outcome is Outcome.APPLIED and session is not None and _is_contradicted(session.state):
         return [
-            f"undo the write: {undo_command(cell_file)}",
+            f"undo the write: {undo}",
             "compare the controller's numbers and the payload with the certificate, then calibrate again",
         ]
-    if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
+    if outcome is Outcome.PROPOSED and session is not None and target is not None:
         calibration = shlex.quote(str(session.folder / CALIBRATION))
         cell = shlex.quote(str(cell_file.absolute()))
         sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
+        command = f"drivegain apply {cell} {calibration}"
+        if target.in_drives:
+            command += " --drives"
         return [
-            *([sign] if session.state.target.unsigned else []),
-            f"drivegain apply {cell} {calibration}",
+            *([sign] if target.unsigned else []),
+            command,
             "check the change, and if it is right, write it:",
-            f"drivegain apply {cell} {calibration} --yes --base {session.state.target.looked_at}",
+            f"{command} --yes --base {target.looked_at}",
         ]
-    if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
-        return [
-            "let the controller load the file",
-            f"to undo it: {undo_command(cell_file)}",
-        ]
+    if outcome is Outcome.APPLIED and target is not None:
+        loading = [] if target.in_drives else ["let the controller load the file"]
+        return [*loading, f"to undo it: {undo}"]
     is_to_go_on = outcome in (Outcome.STOPPED, Outcome.INTERRUPTED)
     if is_to_go_on and session is not None and isinstance(session.state, GuidedState):
         return [f"remove the cause, then start the same command: {goes_on_with(session.state)}"]

@@ -45,8 +45,10 @@ class Standing:
             return StandingState.NOT_KNOWN
         if self.ended is not None:
             return StandingState.REPLACED
+        if self.acceptance is not None and not self.acceptance.accepted:
+            return StandingState.NOT_ACCEPTED
         if self.acceptance is not None:
-            return StandingState.ACCEPTED if self.acceptance.accepted else StandingState.NOT_ACCEPTED
+            return StandingState.ACCEPTED
         if self.write is not None:
             return StandingState.WRITTEN
         return StandingState.NOT_WRITTEN

@@ -375,6 +375,8 @@ def audit_report(found: Verification) -> AuditReport:
 
 _WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
 """Words for an event after which a controller had the gains of a calibration."""
+_VERDICTS = {True: "accepted by", False: "NOT ACCEPTED by"}
+"""Words for what new moves with these gains have shown."""
 
 
 def in_force(cell: Cell, history: History) -> str | None:
@@ -421,7 +423,7 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
             if then is not None and then.action is WriteAction.ROLLED_BACK:
                 parts.append(f"rolled back by {then.who}")
         if entry.acceptance is not None:
-            verdict = "accepted by" if entry.acceptance.accepted else "NOT ACCEPTED by"
+            verdict = _VERDICTS[entry.acceptance.accepted]
             parts.append(f"{verdict} {entry.acceptance.who}")
         if entry.digest == digest_in_force:
             parts.append("in force")

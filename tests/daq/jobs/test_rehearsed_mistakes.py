@@ -1,19 +1,17 @@
-"""Mistakes that were rehearsed in a guided session: each is noticed at its block, which does not count, with what to do.
+"""Mistakes that were rehearsed in a guided session: each is noticed at its block, with what to do.
 
-| mistake | test |
-|---|---|
-| payload in a bare block, or forgotten in a loaded one | `test_guided`: `test_a_block_with_the_wrong_body_is_recorded_again_and_kept` |
-| the other payload | the same test, with 1.7 kg in the place of 4.6 kg |
-| a mass in grams | `test_guided`: `test_a_mass_in_grams_or_of_another_body_is_not_taken` |
-| a changed cell file | `test_guided`: `test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out` |
-| a second terminal | `test_guided`: `test_a_second_terminal_learns_that_the_bus_is_taken` |
-| a block with losses, an axis that trips, a bus that goes away, a full disk | here |
+Here: a block with losses, an axis that trips, a bus that goes away, a full disk. The others are in `test_guided`:
+
+- a payload in a bare block, or forgotten in a loaded one, and the other payload (1.7 kg in the place of 4.6 kg):
+  `test_a_block_with_the_wrong_body_is_recorded_again_and_kept`;
+- a mass in grams: `test_a_mass_in_grams_or_of_another_body_is_not_taken`;
+- a changed cell file: `test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out`;
+- a second terminal: `test_a_second_terminal_learns_that_the_bus_is_taken`.
 """
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,10 +35,9 @@ LOADED = "block-2-loaded"
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulated cell in this process is never that late; waiting for one that is silent would be most of the time."""
     monkeypatch.setattr(daq.workflow.record, "LOCKSTEP_TIMEOUT_S", 0.4)
-    return
 
 
 def ends_at(rig: Rig, kind: type[Exception], code: ExitCode, block: str, kept: str) -> ErrorParts:
@@ -135,10 +132,12 @@ def test_a_disk_that_fills_up_in_a_block_ends_it_and_nothing_moves_before_there_
         asked.append(request.out.stem)
         raise AssertionError
 
-    rig.tools = replace(rig.tools, record=moved, free=lambda _: 10_000)
+    tools = rig.tools
+    rig.tools = replace(tools, record=moved, free=lambda _: 10_000)
     with pytest.raises(DiskSpaceShort, match="nothing has moved; free space"):
         run_session(rig)
     assert asked == []
+    rig.tools = tools
     goes_on(rig, made_session)
 
 
