@@ -11,7 +11,7 @@ that does not end so is an AssertionError.
 
 One session is made first, over the driver. The others copy its recordings, and know the result of its fits. With
 `--real`, recordings are made over the driver, at a simulated cell that is a process of its own and goes on when the
-session is killed. Layout: out/session-kills/<number>.csv.
+session is killed; these kills are all drawn from recordings. Layout: out/session-kills/<number>.csv.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from daq.files import replace_file
 from tests.daq.jobs.made_session import MadeSession, whole_session
 from tests.daq.jobs.test_killed_recording import cell_process
 from tests.daq.jobs.test_killed_session import (
+    Moment,
     TimedCall,
     drawn_moment,
     ends_well_after,
@@ -43,6 +44,8 @@ from tests.studies.output import print_line
 from tests.studies.study_rows import rows_of_unit, work_off
 
 OUT = Path("out/session-kills")
+RECORDINGS = 4  #: Of a session: three blocks, and the moves that accept the gains
+RECORDING_S = 10.0  #: Some time within or behind a recording
 MODULE = "tests.studies.session_kills"
 
 
@@ -76,6 +79,8 @@ def kill(unit: KillUnit, made: MadeSession, calls: Sequence[TimedCall]) -> KillR
     """Kill a session, and let the same command finish it."""
     chance = random.Random(f"{unit.seed} {unit.number}")
     moment = drawn_moment(list(calls), chance)
+    if unit.real:
+        moment = Moment("record", chance.randrange(RECORDINGS), chance.uniform(0.0, RECORDING_S))
     with tempfile.TemporaryDirectory() as place:
         rig = killed_rig(Path(place) / f"cell-{unit.number}", made, real=unit.real)
         if not unit.real:

@@ -42,11 +42,13 @@ class Moment:
     """A moment of a session.
 
     Attributes:
-        call: number of the call of a tool, from 0.
-        wait_s: after its begin.
+        tool: name of a tool.
+        number: of its call, from 0.
+        wait_s: after the begin of this call.
     """
 
-    call: int
+    tool: str
+    number: int
     wait_s: float
 
 
@@ -175,15 +177,16 @@ def timed_calls(rig: Rig) -> list[TimedCall]:
 def drawn_moment(calls: list[TimedCall], chance: random.Random) -> Moment:
     """Any tool first, so that a short stage is as likely as a long one; then any of its calls, and any moment of it."""
     tool = chance.choice(sorted({call.tool for call in calls}))
-    number = chance.choice([index for index, call in enumerate(calls) if call.tool == tool])
-    return Moment(number, chance.uniform(0.0, calls[number].duration_s))
+    of_tool = [call for call in calls if call.tool == tool]
+    number = chance.randrange(len(of_tool))
+    return Moment(tool, number, chance.uniform(0.0, of_tool[number].duration_s))
 
 
 def killed_at(rig: Rig, moment: Moment) -> bool:
     """Run the session in a child and kill it at that moment; return whether it had not ended before."""
     child = session_in_a_child(rig)
     ended = 0
-    while not ended and len(calls_of(rig)) <= moment.call:
+    while not ended and calls_of(rig).count(moment.tool) <= moment.number:
         time.sleep(0.001)
         ended, status = os.waitpid(child, os.WNOHANG)
     if ended:

@@ -11,11 +11,18 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address
+from daq.documents.calibration_file import load_calibration
 from daq.documents.session_state import GuidedState, Outcome
 from daq.errors import ConfigurationInconsistent, ControllerChanged, ExitCode
 from daq.jobs.gain_target import file_of, target_of
 from daq.ledger.audit import AuditAction
+from daq.writeback.drive_target import DriveTarget
+from daq.writeback.request import Request
+from daq.writeback.target import apply, propose
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
+from drivers.canopen.parameters import Saving
+from drivers.errors import ParameterRefused
+from drivers.profiles.profile import Mapping
 from tests.daq.calibrations import NAMEPLATE
 from tests.daq.drives import entered_gain, network_of, saved_gain
 from tests.daq.histories import history_of
@@ -25,15 +32,15 @@ from tests.daq.jobs.rig import Rig, serving
 OBJECT = {"index": 0x2003, "subindex": 1, "type": "i32", "factor": 1000.0}
 
 
-def drives_rig(folder: Path, made: MadeSession) -> Rig:
-    """A rig whose cell has its gains in the drives."""
+def drives_rig(folder: Path, made: MadeSession, mapping: Mapping = Mapping.STORED) -> Rig:
+    """A rig whose cell has its gains in the drives, which do that with mappings when they save."""
     rig = made_session_rig(folder, made)
     document = json.loads(rig.cell_file.read_text())
     document["controller"] = {"objects": [OBJECT] * len(rig.cell.axes)}
     rig.cell_file.write_text(json.dumps(document))
 
     def quick_network(cell: Cell, _block_signals: SignalBlocker) -> CanopenNetwork:
-        return network_of(cell, bus_address(cell))
+        return network_of(cell, bus_address(cell), mapping)
 
     rig.tools = replace(rig.tools, network=quick_network)
     return rig
@@ -109,6 +116,26 @@ def test_drives_that_lost_their_gains_are_noticed_before_anything_moves(
             run_session(rig)
     assert not (rig.session.folder / "acceptance.mcap").exists()
     assert AuditAction.ACCEPTED not in actions_of(rig)
+
+
+def test_drives_that_refuse_to_save_are_written_with_apply_and_the_session_goes_on(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    """As `apply --drives --save-unknown` does it."""
+    rig = drives_rig(tmp_path / "cell", made_session, Mapping.UNKNOWN)
+    with serving(rig):
+        with pytest.raises(ParameterRefused, match="nothing was written"):
+            run_session(rig)
+        assert rig.session.state.outcome is Outcome.STOPPED
+        file = rig.session.folder / "calibration.yaml"
+        request = Request(load_calibration(file), rig.clock(), file=file, content=file.read_bytes())
+        with network_of(rig.cell, bus_address(rig.cell), Mapping.UNKNOWN) as network:
+            proposal = propose(DriveTarget(rig.cell, network, Saving.ANY), request)
+            apply(proposal, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="Kim")
+        assert run_session(rig).exit_code == ExitCode.OK
+    assert actions_of(rig).count(AuditAction.APPLIED) == actions_of(rig).count(AuditAction.ACCEPTED) == 1
+    page = (rig.session.folder / "report" / "report.html").read_text()
+    assert "by Kim to the drives; accepted on " in page
 
 
 def test_without_yes_the_drives_keep_their_gains_and_the_command_for_later_is_said(
