@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from daq.log.feed import Feed, QuickLook
     from daq.workflow.fit import Fit
     from daq.workflow.record import Recorded, RecordingRequest
-    from daq.writeback.file_target import FileEdit
     from daq.writeback.target import Proposal
     from ident.calibration import Calibration
     from ident.discovery.before_after import Account
@@ -121,7 +120,7 @@ class Person:
         """Ask whether a block with a mistake is recorded again; `keep` keeps it."""
         return ask(f"Press Enter to record it again, or type {KEEP} to keep {run.name} as it is") != KEEP
 
-    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+    def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""
         from daq.report.proposal import show_proposal
 

@@ -85,6 +85,7 @@ class PlannedWrite(StrictModel):
     after_sha256: str
     looked_at: str = ""  #: value for `apply --base`
     unsigned: bool = False  #: required signatures are missing
+    in_drives: bool = False  #: into the drives, not into a file
 
 
 class WatchedGain(StrictModel):
@@ -119,8 +120,15 @@ class SessionState(StrictModel):
 
     @property
     def is_over(self) -> bool:
-        """Whether no command goes on with it; a command that was killed before it reported its end did not end it."""
-        return self.outcome is not None and self.outcome.concluded and self.ended is not None
+        """Whether no command goes on with it.
+
+        A command that was killed before it reported its end did not end it; nor did one that an error ended behind the
+        decision, before the certificate had it.
+        """
+        if self.outcome is None or self.ended is None:
+            return False
+        is_cut_short = self.outcome.good and bool(self.problem)
+        return self.outcome.concluded and not is_cut_short
 
     def with_(self, **changed: object) -> SessionState:
         """A copy with other values."""
@@ -169,12 +177,12 @@ class Progress(StrictModel):
 
 
 class ScaleOfAxis(StrictModel):
-    """Measured over predicted torque of a joint on new moves: 1 where its gain is right."""
+    """Measured over predicted torque of a joint on new moves: 1 where its gain is right, None where it did not move."""
 
     axis: str
-    old: float  #: with the previous gain, which the controller had before the write
-    new: float  #: with the current gain, which was written
-    std: float  #: σ of the new one
+    old: float | None  #: with the previous gain, which the controller had before the write
+    new: float | None  #: with the current gain, which was written
+    std: float | None  #: σ of the new one
 
 
 class Acceptance(StrictModel):
@@ -182,8 +190,8 @@ class Acceptance(StrictModel):
 
     log_sha256: str
     scales: tuple[ScaleOfAxis, ...]
-    old_error_percent: float  #: of all axes, with the previous gains
-    new_error_percent: float  #: of all axes, with the current gains
+    old_error_percent: float | None  #: of all axes, with the previous gains; None where it is no number
+    new_error_percent: float | None  #: of all axes, with the current gains
     accepted: bool
     remark: str
 

@@ -152,6 +152,7 @@ SENTENCES = {
     "proposed: an operator has to apply it": "Nothing was written.",
     "session ended": "",  # the end of the session or the error follows
     "accepted": "✓ Accepted: {text}.",
-    "not accepted": "✗ Not accepted: {text}.",
+    "not accepted": "✗ Not accepted: {text}. To undo the write: {undo}",
+    "certified": "Certificate {id}: {text}.",
 }
 """The sentence of each event, with its fields."""

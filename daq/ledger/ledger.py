@@ -36,13 +36,13 @@ from daq.ledger.fold import (
     Entry,
     Event,
     History,
+    RecordedAcceptance,
     at_of,
     entered_calibrations,
     figures_of,
     fold,
     iso,
     shown_writes,
-    text_field,
     unknown_writes,
 )
 from daq.ledger.migration import (
@@ -78,6 +78,7 @@ SESSIONS = frozenset(
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.RECALIBRATION_ENDED,
         AuditAction.ACCEPTED,
+        AuditAction.NOT_ACCEPTED,
     }
 )
 """What `record_session` enters."""
@@ -462,15 +463,8 @@ class StandingState(Enum):
     NOT_WRITTEN = "not written"
     WRITTEN = "written"  #: a controller has its gains
     ACCEPTED = "accepted"  #: it was tried in the cell, and accepted
+    NOT_ACCEPTED = "not accepted"  #: it was tried in the cell, and new moves contradict it
     REPLACED = "replaced"  #: its gains were written, and were replaced or rolled back since
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedAcceptance:
-    """An entry of the audit log that accepts a calibration."""
-
-    at: datetime  #: when, UTC
-    who: str  #: the person or the session
 
 
 @dataclass(frozen=True, slots=True)
@@ -484,7 +478,7 @@ class Standing:
     ended: Event | None = None
     #: Previous gains, at that place before the write, by axis; empty where the ledger does not have them.
     before: Mapping[str, float] = field(default_factory=dict)
-    acceptance: RecordedAcceptance | None = None  #: the last one
+    acceptance: RecordedAcceptance | None = None  #: result of the last new moves with these gains
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
 
     @property
@@ -494,6 +488,8 @@ class Standing:
             return StandingState.NOT_KNOWN
         if self.ended is not None:
             return StandingState.REPLACED
+        if self.acceptance is not None and not self.acceptance.accepted:
+            return StandingState.NOT_ACCEPTED
         if self.acceptance is not None:
             return StandingState.ACCEPTED
         if self.write is not None:
@@ -518,6 +514,7 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
     # Entries that were edited prove nothing.
     entries = verify(ledger.audit, noted_heads(ledger.audit)).intact
     write = _last_write(history, digest, place)
+    acceptances = [one for one in history.acceptances if one.digest == digest]
     before: dict[str, float] = {}
     ended: Event | None = None
     if write is not None:
@@ -528,7 +525,7 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
         write=write,
         ended=ended,
         before=before,
-        acceptance=_last_acceptance(entries, ledger.cell.name, digest),
+        acceptance=acceptances[-1] if acceptances else None,
         history=history,
     )
 
@@ -569,13 +566,3 @@ def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, floa
         if isinstance(axis, str) and isinstance(old, float | int) and math.isfinite(old):
             before[axis] = float(old)
     return before
-
-
-def _last_acceptance(entries: Sequence[AuditEntry], cell: str, digest: str) -> RecordedAcceptance | None:
-    for entry in reversed(entries):
-        if entry.action is not AuditAction.ACCEPTED or text_field(entry, "cell") != cell:
-            continue
-        at = at_of(entry)
-        if at is not None and text_field(entry, "calibration_sha256") == digest:
-            return RecordedAcceptance(at, entry.who)
-    return None

@@ -15,7 +15,7 @@ from typing import Literal
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused
 from daq.files import sha256
-from daq.ledger.fold import Event, WriteAction
+from daq.ledger.fold import Event, RecordedAcceptance, WriteAction
 from daq.ledger.ledger import MAY_LACK, StandingState
 from daq.report.comparison import OPERATORS, Comparison, before_write, changes_from
 from daq.report.document import Figure, Report
@@ -75,7 +75,7 @@ class EarlierCalibration(Report):
 
 
 class StatusEvent(Report):
-    """A write, a rollback or an acceptance."""
+    """A write, a rollback, or new moves with the gains."""
 
     at: str
     who: str
@@ -88,11 +88,21 @@ class StatusWrite(StatusEvent):
     """the controller's file, or the drives"""
 
 
+class StatusAcceptance(StatusEvent):
+    """Result of new moves with these gains."""
+
+    accepted: bool
+    remark: str
+    """what was found"""
+    undo: str
+    """command that undoes the write; empty where they were accepted"""
+
+
 class CertificateStatus(Report):
     """State of a calibration by the audit log of its cell, and by the controller's file where it was read."""
 
     state: str
-    """written, accepted, replaced, not written, or not known"""
+    """written, accepted, not accepted, replaced, not written, or not known"""
     text: str
     """the same as a sentence"""
     as_of: str | None
@@ -101,7 +111,8 @@ class CertificateStatus(Report):
     """last write of these gains; null where there was none"""
     ended: StatusEvent | None
     """write or rollback that put other gains in their place; null where there was none"""
-    acceptance: StatusEvent | None
+    acceptance: StatusAcceptance | None
+    """result of the last new moves with these gains; null where there were none"""
 
 
 class CertificateReport(Report):
@@ -254,6 +265,14 @@ class Certificate:
         return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
 
     @property
+    def contradicted(self) -> str:
+        """What new moves with the written gains have found wrong; empty where nothing is."""
+        acceptance = self.comparison.standing.acceptance
+        if acceptance is None or acceptance.accepted:
+            return ""
+        return acceptance.remark or "the audit log does not say how"
+
+    @property
     def _failed(self) -> list[Refusal]:
         """Failed checks that no operator can open."""
         return [refusal for refusal in self.comparison.refusals if refusal.gate not in OPERATORS]
@@ -273,6 +292,8 @@ class Certificate:
         sentence = f"{text[0].upper()}{text[1:]}"
         if any(row.significant for row in self.changed):
             sentence += f": {changed}"
+        if self.contradicted:
+            sentence += f". New moves contradict them: {self.contradicted}"
         if self._failed:
             sentence += f". Today a check refuses them: {self._reason}"
         return f"{sentence}."
@@ -431,10 +452,22 @@ def status_text(comparison: Comparison) -> str:
     elif comparison.changed_by_hand:
         parts.append("the file has other gains now")
     if standing.acceptance is not None:
-        parts.append(f"accepted on {_when(standing.acceptance.at)} by {standing.acceptance.who}")
+        parts.append(_acceptance_text(standing.acceptance, is_in_place=comparison.in_force is not None))
     if standing.history.may_lack:
         parts.append(MAY_LACK)
     return f"{'; '.join(parts)} (as of {_when(standing.as_of)})"
+
+
+def _acceptance_text(acceptance: RecordedAcceptance, *, is_in_place: bool) -> str:
+    """Say when new moves accepted the gains; otherwise what failed, and how to undo the write if it is in place."""
+    if acceptance.accepted:
+        return f"accepted on {_when(acceptance.at)} by {acceptance.who}"
+    text = f"NOT ACCEPTED on {_when(acceptance.at)} by {acceptance.who}"
+    if acceptance.remark:
+        text += f": {acceptance.remark}"
+    if is_in_place and acceptance.undo:
+        text += f"; to undo the write: {acceptance.undo}"
+    return text
 
 
 def write_text(write: Event) -> str:

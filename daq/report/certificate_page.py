@@ -70,7 +70,10 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
     calibration = certificate.calibration
     look = _LOOK.get(certificate.verdict, "")
     sign = _SIGN[certificate.verdict]
-    if certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
+    if certificate.contradicted:
+        look = _LOOK[Verdict.REFUSED]
+        sign = _SIGN[Verdict.REFUSED]
+    elif certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
         look = ""
         sign = _SIGN[Verdict.READY]
     return html_page(
@@ -110,6 +113,9 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
     """The next step, below the verdict."""
     comparison = certificate.comparison
     if comparison.in_force is not None:
+        acceptance = comparison.standing.acceptance
+        if acceptance is not None and acceptance.undo:
+            yield paragraph(f"To undo the write: `{acceptance.undo}`.", f"next {look}")
         return
     if comparison.unread:
         yield paragraph(comparison.unread, f"next {look}")

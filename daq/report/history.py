@@ -72,6 +72,10 @@ class HistoryPoint(Report):
     created: str
     entered: str
     digest: str
+    accepted: bool | None = None
+    """whether new moves confirm the gains of this calibration; left out where none were made"""
+    accepted_at: str | None = None
+    accepted_by: str | None = None
 
 
 class HistoryAxis(Report):
@@ -371,6 +375,8 @@ def audit_report(found: Verification) -> AuditReport:
 
 _WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
 """Words for an event after which the gains of a calibration were the current gains."""
+_VERDICTS = {True: "accepted by", False: "NOT ACCEPTED by"}
+"""Words for what new moves with these gains have shown."""
 
 
 def in_force(cell: Cell, history: History) -> str | None:
@@ -399,7 +405,13 @@ def in_force(cell: Cell, history: History) -> str | None:
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
-    """Return the writes of each calibration in words, by its digest; events are of all controllers, oldest first."""
+    """Return what was done with each calibration in words, by its digest: writes, rollbacks and acceptance.
+
+    Args:
+        entries: the calibrations.
+        events: writes to all controllers, oldest first.
+        digest_in_force: of the calibration whose gains the controller has; None for other numbers.
+    """
     described = {}
     for entry in entries:
         parts = []
@@ -410,6 +422,9 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
             then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
             if then is not None and then.action is WriteAction.ROLLED_BACK:
                 parts.append(f"rolled back by {then.who}")
+        if entry.acceptance is not None:
+            verdict = _VERDICTS[entry.acceptance.accepted]
+            parts.append(f"{verdict} {entry.acceptance.who}")
         if entry.digest == digest_in_force:
             parts.append("in force")
         described[entry.digest] = ", ".join(parts) or "-"
@@ -463,6 +478,11 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
     if point.entry.events:
         last = point.entry.events[-1]
         known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
+    acceptance = point.entry.acceptance
+    if acceptance is not None:
+        known["accepted"] = acceptance.accepted
+        known["accepted_at"] = acceptance.at
+        known["accepted_by"] = acceptance.who
     return HistoryPoint.of(
         point.entry,
         None,

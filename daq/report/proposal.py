@@ -130,8 +130,7 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
         console.print(terminal_text(f"{sentence[0].upper()}{sentence[1:]}. Nothing needs to be written."))
     console.print()
     if isinstance(edit, DriveEdit):
-        for change, value in zip(edit.changes, edit.values, strict=True):
-            console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}")
+        console.print(terminal_lines(edit.diff.removesuffix("\n")))
     if isinstance(edit, FileEdit) and edit.diff:
         _show_diff(terminal_lines(edit.diff), console)
 

@@ -168,6 +168,15 @@ class DriveEdit(Edit):
         return self.folder
 
     @property
+    def diff(self) -> str:
+        """A line for each drive: its object, its value now, and the one to be written."""
+        lines = [
+            f"{change.key}: {value.value:.9g} -> {change.spelling}\n"
+            for change, value in zip(self.changes, self.values, strict=True)
+        ]
+        return "".join(lines)
+
+    @property
     def has_effect(self) -> bool:
         """Always: drives that have these gains in RAM are made to save them, and lose what they had saved."""
         return True

@@ -36,6 +36,11 @@ class FileEdit(Edit):
     format: ControllerFormat | None = None  #: of the file; None where its name says it
 
     @property
+    def name(self) -> str:
+        """The file as it was named."""
+        return str(self.file)
+
+    @property
     def place(self) -> Path:
         """The file as it was named."""
         return self.file

@@ -131,6 +131,16 @@ class Edit:
     source: Path | None = None  #: backup or record that a rollback restores; None for a calibration
 
     @property
+    def name(self) -> str:
+        """The target as the cell names it."""
+        return self.subject
+
+    @property
+    def diff(self) -> str:
+        """The change as text, empty where there is none."""
+        return ""
+
+    @property
     def place(self) -> Path:
         """File or folder that an error of the file system is reported for."""
         return Path(self.subject)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import partial
+from html import escape
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,18 +36,20 @@ from daq.errors import (
     ExitCode,
     JobHeld,
     NotReleased,
+    OutputFailed,
     UsageError,
 )
 from daq.jobs import calibrate as guided_session
 from daq.jobs import job
 from daq.jobs.acceptance import Accept
 from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, mistake_in
+from daq.jobs.certificate import save_certificate
 from daq.jobs.context import Tools
 from daq.jobs.guided import FIRST_BLOCKS, NEXT_BLOCKS, BlockRole, role_of
 from daq.jobs.operator import GivenAnswers
 from daq.jobs.reporting import Conclusion, ending
 from daq.jobs.session import Session
-from daq.jobs.stages import Decide, Identify, Record, Stage, WatchDrift
+from daq.jobs.stages import TO_DECISION, Certify, Decide, Identify, Record, Stage, WatchDrift
 from daq.ledger.audit import AuditAction
 from daq.report.plan_preview import save_preview
 from daq.simulation import demo
@@ -55,11 +60,12 @@ from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
-from tests.daq.jobs.rig import BEGAN, Rig, serving
+from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
 
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now"})
-"""Tools between which a session reads and writes its own files; the clock is read beside each of them."""
-QUICK = ("drives", "record", "fit", "save_report", "apply", "validate")
+CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network"})
+"""Tools between which a session reads and writes its own files; the clock is read beside each of them, and gains that
+are in a file need no network."""
+QUICK = ("drives", "record", "fit", "save_report", "apply", "validate", "certify")
 """Tools at which every test run interrupts; `processes` takes every call of every tool."""
 
 
@@ -109,6 +115,7 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
         AuditAction.CALIBRATION_ENTERED,
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
+        AuditAction.ACCEPTED,
         AuditAction.RECALIBRATION_ENDED,
     ]
     assert len(history_of(rig.cell_file).events) == 1
@@ -119,11 +126,13 @@ def test_new_moves_show_which_gains_were_wrong_before_the_write(whole_session: t
     acceptance = state_of(whole_session[0]).acceptance
     assert acceptance is not None
     assert acceptance.accepted
+    assert acceptance.new_error_percent is not None
+    assert acceptance.old_error_percent is not None
     assert acceptance.new_error_percent < acceptance.old_error_percent
     by_axis = {scale.axis: scale for scale in acceptance.scales}
     # The previous gain of J4 is 25 % larger than the truth, so its torque is as much too large.
     assert by_axis["J4"].old == pytest.approx(11.52 / 9.21, rel=0.02)
-    assert all(abs(scale.new - 1.0) < 0.02 for scale in acceptance.scales)
+    assert all(scale.new == pytest.approx(1.0, abs=0.02) for scale in acceptance.scales)
 
 
 def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, made_session: MadeSession) -> None:
@@ -135,7 +144,21 @@ def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, ma
     assert acceptance is not None
     assert not acceptance.accepted
     assert "J4 +25" in acceptance.remark
-    assert "NOT ACCEPTED" in (rig.session.folder / "summary.txt").read_text()
+    summary = (rig.session.folder / "summary.txt").read_text()
+    assert "NOT ACCEPTED" in summary
+    undo = f"drivegain rollback {rig.cell_file}"
+    assert f"undo the write: {undo}" in summary
+    (entry,) = [entry for entry in rig.audit if entry.action is AuditAction.NOT_ACCEPTED]
+    assert entry.details["remark"] == acceptance.remark
+    assert entry.details["undo"] == undo
+    (event,) = [event for event in rig.events if event["event"] == "not accepted"]
+    assert event["undo"] == undo
+    page = (rig.session.folder / "report" / "report.html").read_text()
+    assert "NOT ACCEPTED on " in page
+    assert undo in page
+    (calibration,) = history_of(rig.cell_file).entries
+    assert calibration.acceptance is not None
+    assert not calibration.acceptance.accepted
 
 
 def test_the_session_leaves_files_that_the_other_verbs_read(
@@ -219,6 +242,7 @@ def ends_the_same_after(rig: Rig, interruption: Interruption, error: BaseExcepti
     assert actions.count(AuditAction.APPLY_BEGUN) == 1
     assert actions.count(AuditAction.APPLIED) == 1
     assert actions.count(AuditAction.CALIBRATION_ENTERED) == 1
+    assert actions.count(AuditAction.ACCEPTED) == 1
     assert len(rig.backups) == 1
     assert len(history_of(rig.cell_file).events) == 1
 
@@ -259,6 +283,58 @@ def test_a_session_that_is_interrupted_goes_on_with_the_same_command(
     ends_the_same_after(
         made_session_rig(tmp_path / "after", made_session), Interruption(after, last, after=True), after
     )
+
+
+@pytest.mark.parametrize("killed_at", ["", "propose", "apply", "certify"])
+def test_the_certificate_says_who_wrote_and_accepted_the_gains(
+    tmp_path: Path, made_session: MadeSession, calls: list[str], killed_at: str
+) -> None:
+    """Also where the command that has the fit was ended before the write: its details are still on the page."""
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    tools = replace(rig.tools, save_report=partial(save_certificate, rig.cell_file, rig.cell))
+    rig.tools = tools
+    if killed_at:
+        rig.tools = Interruption(KeyboardInterrupt(), calls.index(killed_at)).tools(tools)
+        with pytest.raises(KeyboardInterrupt):
+            run_session(rig)
+        assert "not written (as of " in (rig.session.folder / "report" / "report.html").read_text()
+        rig.tools = tools
+    assert run_session(rig).outcome is Outcome.APPLIED
+    page = (rig.session.folder / "report" / "report.html").read_text()
+    assert f"by {escape(WHO)} to demo.yaml; accepted on " in page
+    assert "not written" not in page
+    assert "Measured and predicted torques" in page
+    (event,) = [event for event in rig.events if event["event"] == "certified"]
+    assert event["id"] in page
+    assert "accepted on " in event["text"]
+
+
+def test_a_certificate_that_cannot_be_written_again_is_a_warning_with_what_to_do(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+
+    def refused(*_: object) -> Any:
+        raise OutputFailed.of(Path("report.html"), OSError(errno.ENOSPC, "No space left on device"))
+
+    rig.tools = replace(rig.tools, certify=refused)
+    assert run_session(rig).exit_code == ExitCode.OK
+    (event,) = [event for event in rig.events if event["event"].startswith("the certificate is that of before")]
+    assert "drivegain certificate " in event["text"]
+
+
+def test_a_result_that_is_no_number_accepts_nothing(tmp_path: Path, made_session: MadeSession) -> None:
+    """Of an axis that did not move in the acceptance run."""
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    moved = made_session.after.use.copy()
+    moved[-1] = False
+    rig.tools = replace(rig.tools, validate=lambda *_: (replace(made_session.after, use=moved),))
+    with np.errstate(invalid="ignore"):
+        assert run_session(rig).outcome is Outcome.APPLIED
+    acceptance = state_of(rig).acceptance
+    assert acceptance is not None
+    assert "J6 did not move" in acceptance.remark
+    assert AuditAction.NOT_ACCEPTED in {entry.action for entry in rig.audit}
 
 
 def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
@@ -430,7 +506,7 @@ def test_the_target_is_in_the_cell_file_and_no_log_depends_on_it(tmp_path: Path,
 def test_job_session_and_demonstration_take_the_same_stages(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They differ in the schedule of runs and in the operator, and a session has a stage more."""
+    """They differ in the schedule of runs and in the operator; a session accepts, and the demonstration has no page."""
     taken: list[tuple[Stage, ...]] = []
 
     def noting(stages: tuple[Stage, ...], *_: object) -> Session:
@@ -451,10 +527,12 @@ def test_job_session_and_demonstration_take_the_same_stages(
     with pytest.raises(JobHeld):
         demo.DemoStages(settings, load_cell(cell_file), lambda: BEGAN, reporter).run(cell_file)
     of_job, of_session, of_demo = taken
-    assert [type(stage) for stage in of_job] == [Record, Identify, WatchDrift, Decide]
-    assert of_demo is of_job
-    assert of_session[:-1] == of_job
-    assert type(of_session[-1]) is Accept
+    assert [type(stage) for stage in of_demo] == [Record, Identify, WatchDrift, Decide]
+    assert of_demo is TO_DECISION
+    assert of_job[:-1] == of_demo
+    assert of_session[:-2] == of_demo
+    assert type(of_session[-2]) is Accept
+    assert type(of_job[-1]) is type(of_session[-1]) is Certify
 
 
 # Blocks for the worst gain

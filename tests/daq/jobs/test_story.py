@@ -22,7 +22,7 @@ from daq.documents.session_state import (
 )
 from daq.jobs.guided import left_s
 from daq.jobs.journal import Form, Level
-from daq.jobs.position import StageName, position_of
+from daq.jobs.position import StageName, goes_on_with, position_of
 from daq.jobs.session import Session, save
 from daq.jobs.story import PARAGRAPHS, SENTENCES, Story
 from daq.log.feed import QuickGain, QuickLook
@@ -122,7 +122,9 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     assert "Every gain is within ± 5 %" in text
     assert "Accepted" in text
     assert "kg more on the flange than without load" in text
-    assert "2026-" not in "".join(line for line in text.splitlines() if "/" not in line)
+    # But for the names of folders, and for the certificate, which says when it was accepted.
+    timeless = [line for line in text.splitlines() if "/" not in line and not line.startswith("Certificate ")]
+    assert "2026-" not in "".join(timeless)
     # A session that reaches its target has no end of its time, and looks after a move are not of the session itself.
     elsewhere = {"quick estimate", "time is up"}
     assert set(PARAGRAPHS) - elsewhere <= {event["event"] for event in rig.events}
@@ -169,6 +171,11 @@ ACCEPTED = Acceptance(
         ({**DECIDED, "outcome": Outcome.APPLIED}, StageName.ACCEPT, "moves that are new"),
         ({**DECIDED, "outcome": Outcome.APPLIED, "ended": ENDED}, StageName.ACCEPT, "moves that are new"),
         ({**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED}, StageName.ENDED, "applied"),
+        (
+            {**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED, "problem": "interrupted"},
+            StageName.ACCEPT,
+            "the certificate",
+        ),
         ({**DECIDED, "outcome": Outcome.PROPOSED, "ended": ENDED}, StageName.ENDED, "proposed"),
     ],
 )
@@ -178,6 +185,20 @@ def test_the_position_of_a_session_is_what_its_state_lacks(
     position = position_of(state(**changed))
     assert position.stage is stage
     assert step in position.next_step
+
+
+@pytest.mark.parametrize(
+    ("changed", "step"),
+    [
+        ({"runs": (_run("block-1-bare"),)}, "it records block-2-loaded again, which does not count yet"),
+        ({}, "it goes on with the next block"),
+        ({"complete": True}, "it records nothing again, and goes on with the identification"),
+        ({**DECIDED, "outcome": Outcome.APPLIED}, "it goes on with the moves that accept the gains"),
+        ({**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED}, "it makes the certificate again"),
+    ],
+)
+def test_the_next_step_after_an_error_is_what_the_same_command_does(changed: dict[str, object], step: str) -> None:
+    assert goes_on_with(state(**changed)).startswith(step)
 
 
 def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(

@@ -407,8 +407,35 @@ def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     record_session(audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
     status = _document(_certificate(cell_file, calibration_file))["status"]
     assert status["state"] == "accepted"
-    assert status["acceptance"] == {"at": NOW.isoformat(), "who": "A. Miller"}
+    assert status["acceptance"] == {
+        "at": NOW.isoformat(),
+        "who": "A. Miller",
+        "accepted": True,
+        "remark": "",
+        "undo": "",
+    }
     assert "; accepted on 2025-01-02 03:00 UTC by A. Miller (as of " in status["text"]
+
+
+def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_undo_it(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    details = {
+        "session": "x",
+        "cell": "demo",
+        "calibration_sha256": sha256(calibration_file.read_bytes()),
+        "remark": "J4 is 25 % off",
+        "undo": "drivegain rollback demo.yaml",
+    }
+    audit = cell_file.with_name("demo.audit.jsonl")
+    record_session(audit, AuditAction.NOT_ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
+    certificate = _certificate(cell_file, calibration_file)
+    status = _document(certificate)["status"]
+    assert status["state"] == "not accepted"
+    assert "; NOT ACCEPTED on 2025-01-02 03:00 UTC by A. Miller: J4 is 25 % off" in status["text"]
+    assert "to undo the write: drivegain rollback demo.yaml" in status["text"]
+    assert certificate.sentence.endswith(". New moves contradict them: J4 is 25 % off.")
+    assert "To undo the write: <code>drivegain rollback demo.yaml</code>" in certificate_page(certificate)
 
 
 def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
