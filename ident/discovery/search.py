@@ -295,9 +295,11 @@ def _judge(
 def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     """Which coefficients are impossible; of a form with more of them than the fewest of its family, without tolerance.
 
-    Two that are nearly collinear each hide in their σ, however certain both together are.
+    Two that are nearly collinear each hide in their σ, however certain both together are. What is left of a rotor may
+    be zero within its σ: it is fitted to say how well the rotor is known.
     """
-    tolerance = 0.0 if len(effect.coefficients) > fewest else SIGMAS
+    is_richer = len(effect.coefficients) > fewest and not effect.settings.get("with_rotor")
+    tolerance = 0.0 if is_richer else SIGMAS
     return impossible(effect.coefficients, trial.coefficients, _sigma(trial), tolerance)
 
 
