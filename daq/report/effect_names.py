@@ -58,6 +58,7 @@ _WHERE = {
     "presliding": "within about {distance_rad:.2g} rad",
     "hinge": "from a position of {start_rad:.2g} rad on",
     "gravity-compensator": "{order:g} times in a turn of the joint",
+    "zero-offset": "to be added to its position",
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""

@@ -557,6 +557,10 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     place = placed.axis if placed.effect.has_axis else None
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
+    if is_correction(placed):  # it is judged by all motors together
+        subject = name if placed.effect.has_axis else "The recording"
+        change = error_change_text(before.total, after.total)
+        return f"{subject} has {what}: the error of all axes {where} {change}."
     if not placed.effect.has_axis:
         return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
     without = before.at(placed.axis)

@@ -40,8 +40,8 @@ from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
-from ident.discovery.acceptance import accept_on_holdout
-from ident.discovery.before_after import error_on, holdout_change
+from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
+from ident.discovery.before_after import error_on
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.geometry_check import GeometryCheck
@@ -545,9 +545,10 @@ def _with_geometry_of_encoders(start: Fit) -> Fit:
 
 
 def check_holdout(fitted: Fit) -> None:
-    """Refuse effects that raise the error of held-out runs by more than its noise.
+    """Refuse effects that raise the error of held-out runs by more than its noise, in total or of a motor.
 
-    `close_loop` has taken out what held-out runs refute; this refuses a fit that was made in another way.
+    `close_loop` has taken out what held-out runs refute, by the same comparison; this refuses a fit that was made in
+    another way. Effects that the cell declares are in both models that are compared.
 
     Raises:
         EffectsRefuted: they do, and the operator has not accepted it.
@@ -555,9 +556,13 @@ def check_holdout(fitted: Fit) -> None:
     if not fitted.steps or fitted.accept_worse_holdout:
         return
     after = fitted.steps[-1].after
-    before = without_effects(after, fitted.identification.estimate)
-    change = holdout_change(before, after)
-    if change is None or not change.is_rise:
+    declared = [step.after for step in fitted.steps if step.declared]
+    before = declared[-1] if declared else without_effects(after, fitted.identification.estimate)
+    if after.holdout is None or after.effects == before.effects:
+        return
+    change = compare_on_holdout(before, before, after)
+    harm = change.harm("held-out runs")
+    if not harm:
         return
     weights_nm_a = before.estimate.gains
     first, last = (
@@ -569,10 +574,10 @@ def check_holdout(fitted: Fit) -> None:
     cold = [one.name for one in unseen if one.temperature_c is None]
     needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
     raise EffectsRefuted(
-        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects),
+        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects[after.declared :]),
         found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
         + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
-        expected=f"no rise by more than its noise over their {change.moves} moves",
+        expected=f"no rise by more than its noise over their {change.total.moves} independent blocks of moves; {harm}",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record more runs for "
         "the fit (or pass --accept-worse-holdout to `drivegain residual`)",
     )

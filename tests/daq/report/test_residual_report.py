@@ -54,7 +54,7 @@ from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, RelativeErrors, account
-from ident.discovery.error_change import PairedChange
+from ident.discovery.error_change import ErrorChange, PairedChange
 from ident.discovery.evidence import with_effects
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.joining import SetAside
@@ -669,8 +669,10 @@ def test_effects_that_held_out_runs_refute_are_not_written(
 ) -> None:
     del shelved
     out, folder = tmp_path / "calibration.yaml", tmp_path / "report"
-    for module in (fit_module, before_after_module):
-        monkeypatch.setattr(module, "holdout_change", lambda *_: PairedChange(5.0, 1.0, 20))
+    rise = PairedChange(5.0, 1.0, 20)
+    monkeypatch.setattr(before_after_module, "holdout_change", lambda *_: rise)
+    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
     for name in ("fit", "close_loop"):
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
     command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), "--report", str(folder)]
@@ -684,8 +686,21 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     assert "because --accept-worse-holdout was given" in capsys.readouterr().out
     assert out.exists()
     assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
-    with pytest.raises(EffectsRefuted, match="20 moves"):
+    with pytest.raises(EffectsRefuted, match="20 independent blocks of moves"):
         fit_module.check_holdout(closed.fitted)
+
+
+def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
+    closed: Closed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rise = PairedChange(5.0, 1.0, 20)
+    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
+    last = closed.fitted.steps[-1]
+    assert last.after.effects
+    fit_module.check_holdout(replace(closed.fitted, steps=(replace(last, declared=True),)))
+    with pytest.raises(EffectsRefuted):
+        fit_module.check_holdout(replace(closed.fitted, steps=(last,)))
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])
@@ -749,9 +764,9 @@ def test_what_rises_is_not_said_to_fall() -> None:
 
 def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
     turned = Parameter("zero-offset offset 3", -math.radians(2.0), math.radians(0.04), "rad")
-    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°"
+    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°, to be added to its position"
     moved = Parameter("zero-offset offset 1", 0.003, 0.0001, "m")
-    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m"
+    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m, to be added to its position"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
