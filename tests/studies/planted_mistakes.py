@@ -83,7 +83,7 @@ class NamedMistake:
     Attributes:
         named: whether it did, on the right axis.
         value, std: of the coefficient in SI, its length where there are several; NaN where it was not named.
-        z: distance of the value found from that which corrects what was planted, in σ; of a turn of gravity by its size.
+        z: distance of the value found from that which corrects what was planted, in σ; of a turn, by its size.
         others: all other effects that joined, but those that the cell declares.
     """
 
