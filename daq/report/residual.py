@@ -355,7 +355,17 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
         if 3.0 * part.choice_std >= part.after_std > 0.0
     ]
     if shares:
-        yield f"σ of the gains includes the choice of the effects (squares add): {', '.join(shares)}."
+        listed = ", ".join(shares)
+        yield f"σ of the gains includes the choice of the effects (squares add): {listed}.{_open_text(fitted)}"
+
+
+def _open_text(fitted: Fit) -> str:
+    """Name the effects that are not in the model and may be true; empty without any."""
+    names = [placed.name_among(fitted.cell.place_names) for placed in fitted.steps[-1].left_open]
+    if not names:
+        return ""
+    verb = "is" if len(names) == 1 else "are"
+    return f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that would move."
 
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:

@@ -37,6 +37,7 @@ from daq.report.plots import draw_fit
 from daq.report.residual import (
     Headline,
     SentenceScreen,
+    _effect_sentence,
     _gear_sentence,
     candidate_rows,
     error_change_text,
@@ -335,6 +336,18 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
 
 
+def test_a_correction_of_the_description_is_told_by_the_error_of_all_axes(closed: Closed) -> None:
+    turn = closed.account.turns[0]
+    assert turn is not None
+    assert turn.before.holdout is not None
+    assert turn.after.holdout is not None
+    sentence = _effect_sentence(
+        closed.fitted, closed.account, turn, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
+    )
+    change = error_change_text(turn.before.holdout.total, turn.after.holdout.total)
+    assert sentence == f"J2 has a zero that is off: the error of all axes on held-out runs {change}."
+
+
 def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed: Closed) -> None:
     """On J2 it is half of σ, on the others a tenth."""
     gains = closed.account.total.gains
@@ -346,6 +359,10 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
     assert sentence in summary(closed.fitted, changed, ())
     assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account, ()))
+    opened = replace(closed.fitted.steps[-1], left_open=(SPRING,))
+    undecided = replace(closed.fitted, steps=(*closed.fitted.steps[:-1], opened))
+    more = f"{sentence} spring on J3 is not in the model and may be true: σ holds what that would move."
+    assert more in summary(undecided, changed, ())
     document = Closed(closed.fitted, changed).document()
     assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
 
