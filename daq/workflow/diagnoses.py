@@ -455,7 +455,7 @@ def _zero_unit(model: Model, axis: int) -> tuple[str, float]:
 
 
 def _zero_text(axis: int, name: str, values: FloatArray, deviations: FloatArray, model: Model) -> str:
-    """How far a zero is off, with σ."""
+    """Say how far a zero is off, with σ."""
     unit, scale = _zero_unit(model, axis)
     return zero_off_text(name, scale * values[0], scale * deviations[0], unit)
 

@@ -394,7 +394,7 @@ def _with_description_after_search(closed: Fit) -> Fit:
 
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
-    """What a fit says of the declared geometry: what its search has found, and what the test beside it has.
+    """Name what is wrong with the declared geometry, by the search of a fit and by the test beside it.
 
     The same mistake of the same axis is said once.
     """
@@ -513,7 +513,7 @@ def _with_uncertain_geometry(found: Fit) -> Fit:
 
 
 def _with_geometry_of_encoders(start: Fit) -> Fit:
-    """As `with_corrected_geometry`, but σ is that of the estimate alone: the geometry's is added after a search."""
+    """Identify again with the geometry of the encoders, and leave its uncertainty to be added after a search."""
     finding = start.geometry
     if finding is None or not finding.corrections:
         return start

@@ -1,4 +1,4 @@
-"""How far a zero is off, in the same words wherever it is said: by torque, by encoders, and on the certificate.
+"""The words for a zero that is off: the same by torque, by encoders, and on the certificate.
 
 The number is what has to be added: to the positions of the axis, and so to its `zero_offset_…` in the cell file. A zero
 that was declared 2° too large is off by -2°.

@@ -106,7 +106,7 @@ def _by_open_effect(
 ) -> FloatArray:
     """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size); no row where the fit contains it."""
     effect = placed.effect
-    if isinstance(effect, GeometryEffect):  # what was applied of it has been taken back
+    if isinstance(effect, GeometryEffect):  # the description no longer has its applied part
         effect = effect.with_applied([0.0] * len(effect.coefficients))
     columns = whitened_columns(search_problem, effect, placed.axis)
     (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))

@@ -139,8 +139,8 @@ def refined_rotor(
 ) -> Effect:
     """Return a loss with the rotor's inertia that its fit calls for, or the same effect where that is close enough.
 
-    Where the fit calls for a rotor whose inertia is certainly negative, none can be told from the links: the loss then
-    multiplies the whole load.
+    Where the fit calls for a rotor whose inertia is certainly negative, the data show none: the loss then multiplies
+    the load with the rotor in it.
 
     Args:
         search_problem: around the fit.

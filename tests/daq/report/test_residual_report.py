@@ -336,7 +336,7 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
 
 
-def test_a_correction_of_the_description_is_told_by_the_error_of_all_axes(closed: Closed) -> None:
+def test_a_correction_of_the_description_is_shown_by_the_error_of_all_axes(closed: Closed) -> None:
     turn = closed.account.turns[0]
     assert turn is not None
     assert turn.before.holdout is not None

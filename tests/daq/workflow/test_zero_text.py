@@ -26,7 +26,7 @@ STD_DEG = 0.04
 
 
 def _by_torque(value_rad: float) -> Finding:
-    """What the torques say: the offset that has to be added to the position of the second axis."""
+    """A finding by torques: the offset that has to be added to the position of the second axis."""
     return Finding(
         effect=ZeroOffset(),
         axis=1,
@@ -45,7 +45,7 @@ def _by_torque(value_rad: float) -> Finding:
 
 
 def _by_encoders(value_rad: float) -> GeometryFinding:
-    """What redundant encoders say of the second axis of a closed chain."""
+    """A finding by redundant encoders, of the second axis of a closed chain."""
     parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
     correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
     return GeometryFinding(4e-4, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ())
