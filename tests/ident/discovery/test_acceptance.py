@@ -14,8 +14,9 @@ from ident.discovery import acceptance
 from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
 from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.evidence import Evidence, with_effects
-from ident.discovery.gates import Gates
-from ident.discovery.loop import Step, find_effects
+from ident.discovery.gates import Gates, own_unknowns
+from ident.discovery.joining import linearised
+from ident.discovery.loop import Step, end_search, find_effects
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
@@ -154,6 +155,26 @@ def test_a_refuted_effect_adds_nothing_to_sigma(small: Evidence, small_truth: Tr
     assert verdict.judgement is Judgement.REFUTED
     assert last.left_open == ()
     assert last.after.estimate.gains_std == pytest.approx(start.estimate.gains_std)
+
+
+def test_what_is_left_passes_every_gate_again(sticking: Evidence) -> None:
+    """A spring that is not there, with a σ that shows it: the folds and the random signs of the moves do not."""
+    steps = _steps(sticking, (STICKING, SPRING))
+    joined = with_effects(sticking, (SPRING,))
+    own = len(joined.estimate.gains) + own_unknowns(joined.estimate, joined.effects)
+    covariance = joined.estimate.covariance.copy()
+    covariance[own, :] = 0.0
+    covariance[:, own] = 0.0
+    covariance[own, own] = 1e-12
+    certain = replace(joined, estimate=replace(joined.estimate, covariance=covariance))
+    model = linearised(certain, {})
+    last = end_search(steps, model, Gates(draws=199), rng=np.random.default_rng(0))
+    assert last.after.effects == ()
+    assert last.left_open == (SPRING,)
+    assert last.set_aside[-1].words.startswith("without what has left, ")
+    # Where nothing has left, the search itself has just asked.
+    unchanged = (*steps[:-1], replace(steps[-1], after=certain))
+    assert end_search(unchanged, model, Gates(draws=199), rng=np.random.default_rng(0)).after.effects == (SPRING,)
 
 
 def test_few_held_out_moves_decide_nothing(small: Evidence, small_truth: Truth) -> None:
