@@ -13,6 +13,7 @@ from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
+from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
@@ -167,10 +168,13 @@ def encoder_text(misfit: EncoderMisfit) -> str:
 
 
 def _correction_text(one: GeometryCorrection) -> str:
-    """Write what has to be added to a number of the description."""
-    scale, unit = (180.0 / math.pi, "deg") if one.unit == "rad" else (1e3, "mm")
-    place = one.joint if not one.end else f"{one.joint} to {one.end}"
-    return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
+    """Say how far a number of the description is off, as the diagnoses do."""
+    if one.kind == "zero":
+        unit, scale = (DEGREES, 180.0 / math.pi) if one.unit == "rad" else (MILLIMETRES, 1e3)
+        return zero_off_text(one.joint, scale * one.change, scale * one.std, unit)
+    longer = "longer" if one.change > 0.0 else "shorter"
+    size = f"{1e3 * abs(one.change):.4f} ± {max(1e3 * one.std, 5e-5):.4f} mm"
+    return f"a {one.kind} from {one.joint} to {one.end} that is {size} {longer} than described"
 
 
 def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:

@@ -355,7 +355,17 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
         if 3.0 * part.choice_std >= part.after_std > 0.0
     ]
     if shares:
-        yield f"σ of the gains includes the choice of the effects (squares add): {', '.join(shares)}."
+        listed = ", ".join(shares)
+        yield f"σ of the gains includes the choice of the effects (squares add): {listed}.{_open_text(fitted)}"
+
+
+def _open_text(fitted: Fit) -> str:
+    """Name the effects that are not in the model and may be true; empty without any."""
+    names = [placed.name_among(fitted.cell.place_names) for placed in fitted.steps[-1].left_open]
+    if not names:
+        return ""
+    verb = "is" if len(names) == 1 else "are"
+    return f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that would move."
 
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
@@ -557,6 +567,10 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     place = placed.axis if placed.effect.has_axis else None
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
+    if is_correction(placed):  # it is judged by all motors together
+        subject = name if placed.effect.has_axis else "The recording"
+        change = error_change_text(before.total, after.total)
+        return f"{subject} has {what}: the error of all axes {where} {change}."
     if not placed.effect.has_axis:
         return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
     without = before.at(placed.axis)
