@@ -12,7 +12,7 @@ from rich.table import Table
 from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
-from daq.workflow.geometry_diagnoses import misfit_text
+from daq.workflow.geometry_diagnoses import UNEXPLAINED, misfit_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
@@ -155,21 +155,36 @@ def encoder_text(misfit: EncoderMisfit) -> str:
     if not misfit.significant:
         return f"fit the loops of the described geometry within {described}"
     left = misfit_text(misfit.left, misfit.unit)
+    noise = ""
+    if misfit.noise is not None:
+        noise = f", where their noise is {misfit_text(misfit.noise, misfit.unit)}"
+    if misfit.late_encoders:
+        return (
+            f"miss the loops by {described}{noise}, explained by {misfit.late_encoders}, which leaves {left}; the "
+            "gains are those of the described geometry"
+        )
     if not misfit.corrections:
-        return f"miss the loops by {described}; no three zeros or lengths explain it, all together leave {left}"
+        return (
+            f"miss the loops by {described}{noise}, which {UNEXPLAINED}; all zeros and lengths together leave {left}; "
+            "the gains are those of the described geometry"
+        )
     texts = " and ".join(map(_correction_text, misfit.corrections))
     others = f", or by {'; or by '.join(misfit.alternatives)}" if misfit.alternatives else ""
     used = "corrected" if misfit.applied else "described"
     return (
-        f"miss the loops by {described}, explained by {texts}{others}, which leaves {left}; the gains are those of the "
-        f"{used} geometry"
+        f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; the gains are those "
+        f"of the {used} geometry"
     )
 
 
 def _correction_text(one: GeometryCorrection) -> str:
     """Write what has to be added to a number of the description."""
     scale, unit = (180.0 / math.pi, "deg") if one.unit == "rad" else (1e3, "mm")
-    place = one.joint if not one.end else f"{one.joint} to {one.end}"
+    place = one.joint
+    if one.kind == "length":
+        place = f"{one.joint} to {one.end}"
+    elif one.kind == "place":
+        place = f"{one.joint} in {one.end}"
     return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
 
 
