@@ -10,7 +10,7 @@ from ident.estimators.encoder_noise import RunDirections, estimate_noise
 
 FloatArray = NDArray[np.float64]
 SAMPLES = 150
-TIME_S = 0.04 * np.arange(SAMPLES)
+TIME_S: FloatArray = np.asarray(0.04 * np.arange(SAMPLES), dtype=np.float64)
 DRAWS = 30
 
 
