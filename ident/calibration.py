@@ -128,10 +128,11 @@ class PayloadMass:
 class GeometryCorrection:
     """A number of the robot's description that the encoders contradict."""
 
-    kind: str  #: `zero` of a joint, or `length` of a link
-    joint: str  #: name of the joint with the zero, or of the one that moves the link
-    end: str  #: of a length: name of the joint or of the closure at the other end of the link; empty for a zero
-    described: float  #: as the fit found it described: the zero offset, or the length [unit]
+    kind: str  #: `zero` of a joint, `length` of a link, or `place` of a joint on the base
+    joint: str  #: name of the joint with the zero, on the base, or of the one that moves the link
+    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x, y or z.
+    end: str
+    described: float  #: as the fit found it described: the zero offset, the length, or the coordinate [unit]
     change: float  #: what has to be added to it [unit]
     std: float  #: σ of the change [unit]
     unit: str  #: rad or m
@@ -142,13 +143,16 @@ class EncoderMisfit:
     """How well the encoders of a robot with more of them than degrees of freedom fit its loops, and why not better."""
 
     described: float  #: root mean square of the misfit with the described geometry [unit]
-    left: float  #: the same with the corrections; without any, with all zeros and lengths that fit best [unit]
+    left: float  #: the same with the explanation; without any, with all zeros and lengths that fit best [unit]
     unit: str  #: rad; with prismatic axes `rad or robot size`
     significant: bool  #: the described one is more than noise makes
-    corrections: tuple[GeometryCorrection, ...]  #: the fewest numbers that explain it; empty without an explanation
+    #: The fewest numbers that explain it; empty without an explanation, and where late encoders explain it.
+    corrections: tuple[GeometryCorrection, ...]
     applied: bool  #: the gains and parameters of the calibration are those of the corrected geometry
     alternatives: tuple[str, ...] = ()  #: other explanations that these positions cannot distinguish from it
     unobservable: tuple[str, ...] = ()  #: directions of zeros and lengths that no position shows
+    noise: float | None = None  #: of the encoders, likewise [unit]; None in calibrations of earlier versions
+    late_encoders: str = ""  #: the explanation, in words, where an encoder is late; empty elsewhere
 
 
 @dataclass(frozen=True, slots=True)

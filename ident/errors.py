@@ -176,7 +176,7 @@ class Diagnosis:
 
     #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
     #: gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned, length-off, payload-differs,
-    #: position-late, position-reversed, torque-above-limit, zero-off, zero-turned.
+    #: place-off, position-late, position-reversed, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -52,6 +52,8 @@ class ApplyPolicy:
     max_std_percent: _Percent = 3.0  #: relative standard deviation of the identified gain [%]
     max_error_percent: _Percent = 25.0  #: relative error of all torques, on held-out data where available [%]
     max_axis_error_percent: _Percent = 50.0  #: the same for each axis [%]
+    #: Misfit of redundant encoders that nothing explains [mrad, or thousandths of the robot's size].
+    max_encoder_misfit_mrad: Annotated[float, Field(ge=0)] = 0.1
     #: Age of the oldest log [days]; None to ignore it, as for imported logs without the time of day.
     max_age_days: Annotated[float, Field(gt=0)] | None = 30.0
     max_saturated_percent: _Percent = 2.0  #: share of an axis's samples in which a limit was active [%]

@@ -129,7 +129,7 @@ class PayloadMassEntry(StrictModel):
 class GeometryCorrectionEntry(StrictModel):
     """One number of the robot's description that the encoders contradict."""
 
-    kind: Literal["zero", "length"]
+    kind: Literal["zero", "length", "place"]
     joint: str
     end: str
     described: _Number
@@ -149,6 +149,8 @@ class EncoderMisfitEntry(StrictModel):
     applied: bool
     alternatives: tuple[str, ...]
     unobservable: tuple[str, ...]
+    noise: _Positive | None = None  # files of earlier versions lack it
+    late_encoders: str = ""  # likewise
 
 
 class CalibrationBody(StrictModel):

@@ -12,7 +12,7 @@ from rich.table import Table
 from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
-from daq.workflow.geometry_diagnoses import misfit_text
+from daq.workflow.geometry_diagnoses import UNEXPLAINED, misfit_text
 from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
@@ -156,14 +156,25 @@ def encoder_text(misfit: EncoderMisfit) -> str:
     if not misfit.significant:
         return f"fit the loops of the described geometry within {described}"
     left = misfit_text(misfit.left, misfit.unit)
+    noise = ""
+    if misfit.noise is not None:
+        noise = f", where their noise is {misfit_text(misfit.noise, misfit.unit)}"
+    if misfit.late_encoders:
+        return (
+            f"miss the loops by {described}{noise}, explained by {misfit.late_encoders}, which leaves {left}; the "
+            "gains are those of the described geometry"
+        )
     if not misfit.corrections:
-        return f"miss the loops by {described}; no three zeros or lengths explain it, all together leave {left}"
+        return (
+            f"miss the loops by {described}{noise}, which {UNEXPLAINED}; all zeros and lengths together leave {left}; "
+            "the gains are those of the described geometry"
+        )
     texts = " and ".join(map(_correction_text, misfit.corrections))
     others = f", or by {'; or by '.join(misfit.alternatives)}" if misfit.alternatives else ""
     used = "corrected" if misfit.applied else "described"
     return (
-        f"miss the loops by {described}, explained by {texts}{others}, which leaves {left}; the gains are those of the "
-        f"{used} geometry"
+        f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; the gains are those "
+        f"of the {used} geometry"
     )
 
 
@@ -172,8 +183,12 @@ def _correction_text(one: GeometryCorrection) -> str:
     if one.kind == "zero":
         unit, scale = (DEGREES, 180.0 / math.pi) if one.unit == "rad" else (MILLIMETRES, 1e3)
         return zero_off_text(one.joint, scale * one.change, scale * one.std, unit)
+    std_mm = max(1e3 * one.std, 5e-5)
+    if one.kind == "place":
+        size = f"{1e3 * one.change:+.4f} ± {std_mm:.4f} mm"
+        return f"the place of {one.joint} on the base off by {size} in {one.end} (to be added to it)"
     longer = "longer" if one.change > 0.0 else "shorter"
-    size = f"{1e3 * abs(one.change):.4f} ± {max(1e3 * one.std, 5e-5):.4f} mm"
+    size = f"{1e3 * abs(one.change):.4f} ± {std_mm:.4f} mm"
     return f"a {one.kind} from {one.joint} to {one.end} that is {size} {longer} than described"
 
 

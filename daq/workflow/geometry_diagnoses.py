@@ -22,8 +22,20 @@ from ident.model.robot import JointKind
 if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
     from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 
-NAMES = {GeometryKind.ZERO: "zero-off", GeometryKind.LENGTH: "length-off"}  #: Diagnoses of one wrong number
+NAMES = {
+    GeometryKind.ZERO: "zero-off",
+    GeometryKind.LENGTH: "length-off",
+    GeometryKind.PLACE: "place-off",
+    GeometryKind.DELAY: "position-late",
+}  #: Diagnoses of one cause
 SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
+UNEXPLAINED = "no zero, length, place on the base or late encoder explains, nor any three of them"
+LOOK_FOR = (
+    "look for arms that bend, play in joints, encoders that do not count evenly, and more than three wrong numbers; "
+    "measure zeros, lengths and places, and correct cell file and URDF"
+)
+MM = 1e-3  #: [m]
+MS = 1e-3  #: [s]
 ANGLE = "rad"  #: Unit of misfits of a robot without prismatic axes
 _SHOWN_ALTERNATIVES = 3
 
@@ -40,31 +52,34 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
         return
     unit = _misfit_unit(model_of(cell))
     misfit = f"encoders that miss the loops by {misfit_text(finding.misfit, unit)}"
-    expected = f"{misfit_text(finding.misfit_left, unit)}, as with zeros and lengths that fit them"
-    used = "the gains are those of the corrected geometry"
-    if not applied:
+    expected = f"{misfit_text(finding.noise, unit)}, the noise of the encoders"
+    if applied:
+        used = "the gains are those of the corrected geometry"
+    elif finding.corrections:
         used = "the gains are those of the described geometry: `drivegain residual` identifies with the corrected one"
-    if not finding.corrections:
+    else:
+        used = "the gains are those of the described geometry"
+    if not finding.causes:
         yield Diagnosis(
             name=SEVERAL,
             runs=(),
             axes=(),
-            found=f"{misfit}, which no three zeros or lengths explain",
+            found=f"{misfit}, which {UNEXPLAINED}",
             expected=expected,
-            remedy="measure zeros and lengths, and correct cell file and URDF; the gains are those of the described",
+            remedy=f"{LOOK_FOR}; {used}",
         )
         return
-    texts = [_correction_text(one, cell) for one in finding.corrections]
-    remedies = [_remedy(one, cell) for one in finding.corrections]
-    several = len(finding.corrections) > 1
+    texts = [_correction_text(one, cell) for one in finding.causes]
+    remedies = [_remedy(one, cell) for one in finding.causes]
+    several = len(finding.causes) > 1
     ambiguous = ""
     if finding.alternatives:
         others = [_explanation_text(other, cell) for other in finding.alternatives[:_SHOWN_ALTERNATIVES]]
         ambiguous = f" (not distinguishable from {'; '.join(others)})"
     yield Diagnosis(
-        name=SEVERAL if several else NAMES[finding.corrections[0].parameter.kind],
+        name=SEVERAL if several else NAMES[finding.causes[0].parameter.kind],
         runs=(),
-        axes=tuple(_axes_of(finding.corrections, cell)),
+        axes=tuple(_axes_of(finding.causes, cell)),
         found=f"{misfit}, which {' and '.join(texts)} {'explain together' if several else 'explains alone'}{ambiguous}",
         expected=expected,
         remedy=f"{', and '.join(remedies)}; {used}",
@@ -83,14 +98,14 @@ def misfit_text(misfit: float, unit: str) -> str:
 
 
 def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[str]:
-    """Axes of the zeros among corrections."""
+    """Axes of the zeros and delays among causes."""
     for one in corrections:
-        if one.parameter.kind is GeometryKind.ZERO:
+        if one.parameter.kind in (GeometryKind.ZERO, GeometryKind.DELAY):
             yield _axis_of(one.parameter, cell).name
 
 
 def _axis_of(parameter: GeometryParameter, cell: Cell) -> CellAxis:
-    """Axis of a zero.
+    """Axis of a zero or a delay.
 
     Raises:
         ModelError: no axis has a joint of this name.
@@ -110,12 +125,22 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
     """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its position)`."""
-    if one.parameter.kind is GeometryKind.ZERO:
-        axis = _axis_of(one.parameter, cell)
-        return zero_off_text(axis.name, one.change / axis.unit.si, one.std / axis.unit.si, _unit_of_zero(axis))
-    longer = "longer" if one.change > 0.0 else "shorter"
-    size = _size_text(abs(one.change), one.std, 1e-3)
-    return f"a {one.parameter.name} that is {size} mm {longer} than described"
+    match one.parameter.kind:
+        case GeometryKind.ZERO:
+            axis = _axis_of(one.parameter, cell)
+            return zero_off_text(axis.name, one.change / axis.unit.si, one.std / axis.unit.si, _unit_of_zero(axis))
+        case GeometryKind.LENGTH:
+            longer = "longer" if one.change > 0.0 else "shorter"
+            size = _size_text(abs(one.change), one.std, MM)
+            return f"a {one.parameter.name} that is {size} mm {longer} than described"
+        case GeometryKind.PLACE:
+            size = _size_text(one.change, one.std, MM, sign="+")
+            place = f"the place of {one.parameter.joint} on the base"
+            return f"{place} off by {size} mm in {one.parameter.end} (to be added to it)"
+        case GeometryKind.DELAY:
+            late = "late" if one.change > 0.0 else "early"
+            size = _size_text(abs(one.change), one.std, MS)
+            return f"an encoder of {_axis_of(one.parameter, cell).name} that is {late} by {size} ms"
 
 
 def _unit_of_zero(axis: CellAxis) -> str:
@@ -123,22 +148,29 @@ def _unit_of_zero(axis: CellAxis) -> str:
     return DEGREES if axis.unit.si_name == "rad" else MILLIMETRES
 
 
-def _size_text(value: float, std: float, unit_si: float) -> str:
+def _size_text(value: float, std: float, unit_si: float, sign: str = "") -> str:
     """Write a size with σ, to a figure that a description can hold."""
     shown_std = max(std / unit_si, 5e-5)
-    return f"{value / unit_si:.4f} ± {shown_std:.4f}"
+    return f"{value / unit_si:{sign}.4f} ± {shown_std:.4f}"
 
 
 def _remedy(one: GeometryEstimate, cell: Cell) -> str:
-    if one.parameter.kind is GeometryKind.ZERO:
-        axis = _axis_of(one.parameter, cell)
-        change = one.change / axis.unit.si
-        std = one.std / axis.unit.si
-        described = axis.zero_offset_rad / axis.unit.si
-        return zero_remedy(axis.name, change, std, _unit_of_zero(axis), described)
-    length_m = described_length(model_of(cell).robot, one.parameter)
-    right = f"{1e3 * (length_m + one.change):.3f} mm in place of {1e3 * length_m:.3f} mm"
-    return f"correct the {one.parameter.name} in the URDF: {right}"
+    match one.parameter.kind:
+        case GeometryKind.ZERO:
+            axis = _axis_of(one.parameter, cell)
+            change = one.change / axis.unit.si
+            std = one.std / axis.unit.si
+            described = axis.zero_offset_rad / axis.unit.si
+            return zero_remedy(axis.name, change, std, _unit_of_zero(axis), described)
+        case GeometryKind.LENGTH | GeometryKind.PLACE:
+            length_m = described_length(model_of(cell).robot, one.parameter)
+            right = f"{(length_m + one.change) / MM:.3f} mm in place of {length_m / MM:.3f} mm"
+            return f"correct the {one.parameter.name} in the URDF: {right}"
+        case GeometryKind.DELAY:
+            return (
+                f"look for what delays the encoder of {_axis_of(one.parameter, cell).name} alone: a filter, a slower "
+                "channel, another time stamp than that of the other axes"
+            )
 
 
 # What a calibration keeps
@@ -150,6 +182,8 @@ def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: b
         return None
     return EncoderMisfit(
         described=_rounded(finding.misfit),
+        noise=_rounded(finding.noise),
+        late_encoders="" if finding.corrections else _late_text(finding, cell),
         left=_rounded(finding.misfit_left),
         unit=_misfit_unit(model_of(cell)),
         significant=finding.is_significant,
@@ -158,6 +192,12 @@ def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: b
         alternatives=tuple(_explanation_text(other, cell) for other in finding.alternatives),
         unobservable=finding.unobservable,
     )
+
+
+def _late_text(finding: GeometryFinding, cell: Cell) -> str:
+    """Explanations in which an encoder is late, and those that cannot be distinguished from them."""
+    explanations = (finding.causes, *finding.alternatives)
+    return "; or by ".join(_explanation_text(one, cell) for one in explanations)
 
 
 def _kept(one: GeometryEstimate, cell: Cell) -> GeometryCorrection:

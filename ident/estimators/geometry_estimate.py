@@ -1,35 +1,44 @@
-"""Zeros and lengths of a robot with more encoders than degrees of freedom, from its recorded positions alone.
+"""Zeros, lengths and base places of a robot with more encoders than degrees of freedom, from its positions alone.
 
-The pose that fits the m encoders best leaves a misfit e(θ) of m − d numbers a sample. Where the description is right,
-it is the encoders' noise. θ are the changes of the described zeros and lengths (`ident.model.geometry`). The whole of
-them is estimated by Gauss-Newton; linearised around that estimate, e ≈ J θ − y, the misfit of every choice of few
-numbers is a small linear problem. The choice with the fewest numbers that leaves no more than the whole one does, by an
-F test, is the explanation: one zero or one length before two, two before three. Numbers that are not in it stay as they
-are described. Positions are used as they were recorded: a low-pass bends a closed loop, and the encoders' noise is that
-of their counts.
+The pose that fits the m encoders best leaves a misfit of m − d numbers a sample, e(θ) in the directions in which it can
+be. Where the description is right, it is the encoders' noise. θ are the changes of zeros, lengths and base places
+(`ident.model.geometry`), and a delay of each encoder. The whole of them is estimated by Gauss-Newton; linearised around
+that estimate, e ≈ J θ − y, the misfit of every choice of few numbers is a small linear problem. A choice is an
+explanation where it leaves
 
-Correlated misfits, as of arms that bend, are no noise of counts: σ² is multiplied by how much more the sums over
-stretches of two seconds scatter than those of independent samples do.
+- no more than the whole of them does (F test), and
+- no more than the encoders' own noise, which counts and differences from sample to sample show.
+
+The second is absolute. Arms that bend leave a misfit that depends on the pose, and so does every zero and length: some
+three of them always take most of it, but not down to the noise. The explanation with the fewest numbers is taken, one
+before two before three. Numbers that are not in it stay as they are described. More than three wrong numbers are not
+told from a cause that is no number at all, and nothing is corrected then.
+
+Positions are used as they were recorded: a low-pass bends a closed loop, and the encoders' noise is that of their
+counts. Its correlation is estimated (`ident.estimators.encoder_noise`), and all rows are made white by it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 import scipy  # loads its modules when they are first used
 
-from ident.arrays import FloatArray, IntArray
-from ident.data.dataset import LONGEST_MOVE_S
+from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Run
+from ident.estimators.encoder_noise import MisfitNoise, RunDirections, estimate_noise
 from ident.model.closed_chain import positions, reach_near
 from ident.model.closures import loops
 from ident.model.geometry import (
     GeometryChange,
     GeometryKind,
     GeometryParameter,
+    base_places,
+    encoder_delays,
     geometry_parameters,
     with_geometry,
 )
@@ -38,36 +47,68 @@ from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
 
 SPACING_S = 0.02  #: Least time between two positions that are used
-MOST_POSITIONS = 600  #: Of all runs together; σ of a zero is then some 10⁻⁶ rad
+MOST_ROWS = 600  #: Misfits of all runs together; σ of a zero is then some 10⁻⁶ rad
 LEAST_POSITIONS = 50  #: Fewer positions judge no geometry
-MOST_CAUSES = 3  #: Numbers of the description that are looked for one by one; then all together
+WINDOW_S = 0.02  #: Before and after a position, for the polynomial of its motion
+LEAST_WINDOW = 3  #: Samples on either side
+DEGREE = 4  #: Of that polynomial; at 3 Hz it is right to 1e-4 of the amplitude
+SMALLEST_COUNT_RAD = 1e-10  #: Smaller steps between two positions are rounding
+MOST_CAUSES = 3  #: Numbers of an explanation
+MOST_TURNS = 3  #: Estimates of the best choice of so many numbers, until it stays the best
 STEP = 1e-4  #: Change of a length from which the derivative of the closures is taken [of the robot's size]
 ITERATIONS = 8
 SETTLED = 1e-10  #: Change at which the iteration ends [rad, or of the robot's size]
+SETTLED_SIGMAS = 0.1  #: Change of all misfits together at which that of all numbers ends [σ of one misfit]
 SMALLEST_SINGULAR = 1e-9  #: Relative to the largest: rounding
 LARGEST_STD = 1e-2
-"""Direction with a larger σ [rad, or of the robot's size], half a degree: it counts as one that cannot be seen."""
+"""Direction of zeros and lengths with a larger σ [rad, or of the robot's size], half a degree: it cannot be seen."""
+TESTED_STD = 1e-3
+"""Directions of all numbers together with a larger σ test no explanation: they would be estimated so far from the truth
+that a linear problem around them is none of the truth."""
 PROBABILITY = 1e-4  #: That the true explanation is refused, and that noise alone is taken for a wrong description
 SMALLEST_MISFIT = 2e-5
-"""Misfit [rad, or of the robot's size] below which nothing is said: one twenty times larger moves a gain by 7 to 9 of
-its σ, so this one by less than half of one."""
+"""Misfit above the noise [rad, or of the robot's size] below which nothing is said: one twenty times larger moves a
+gain by 7 to 9 of its σ, so this one by less than half of one."""
+TOLERATED_MISFIT = 1e-5
+"""Misfit above the known noise that an explanation may leave, half of what is not reported: slow noise of an encoder,
+in which neighbouring samples hardly differ, is not among the known noise."""
+TOLERATED_SHARE = 0.02  #: The same as a share of the misfit: of a small one, some three numbers take most by chance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Positions:
-    """Some recorded positions of one run."""
+    """Some recorded positions of one run, with what is around them in time."""
 
     run: str  #: its name
+    time_s: FloatArray  #: of each, shape (k,)
     position_rad: FloatArray  #: of the axes, as recorded, shape (k, m)
-    stretch: IntArray  #: number of the stretch of LONGEST_MOVE_S that each belongs to, shape (k,)
+    before_rad: FloatArray  #: one sample earlier, shape (k, m)
+    after_rad: FloatArray  #: one sample later, shape (k, m)
+    interval_s: float  #: between two samples of the run
+    #: Coefficients of t, t², … of the motion around each position [rad/sⁿ], shape (k, m, DEGREE).
+    motion: FloatArray
+    count_rad: FloatArray  #: smallest step of each axis, shape (m,)
+
+    def every(self, stride: int) -> Positions:
+        """Return every so many positions."""
+        return Positions(
+            self.run,
+            self.time_s[::stride],
+            self.position_rad[::stride],
+            self.before_rad[::stride],
+            self.after_rad[::stride],
+            self.interval_s,
+            self.motion[::stride],
+            self.count_rad,
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryEstimate:
-    """A number of the description that is wrong."""
+    """A number of the description that is wrong, or the delay of an encoder."""
 
     parameter: GeometryParameter
-    change: float  #: what has to be added to it [rad or m]
+    change: float  #: what has to be added to it [rad or m]; of a delay, the delay [s]
     std: float  #: σ of the change
 
 
@@ -78,14 +119,24 @@ class GeometryFinding:
     #: Root mean square of what is left of the encoders' positions beside the pose that fits them best, a direction
     #: [rad, or of the robot's size], with the described geometry.
     misfit: float
-    misfit_left: float  #: the same with the corrections; where there are none, with all numbers estimated
+    misfit_left: float  #: the same with the causes; where there are none, with all zeros and lengths estimated
+    noise: float  #: the same of the encoders' noise, by counts and by differences from sample to sample
     is_significant: bool  #: the description leaves more misfit than noise does
-    corrections: tuple[GeometryEstimate, ...]  #: the explanation with the fewest numbers; empty without one
+    causes: tuple[GeometryEstimate, ...]  #: the explanation with the fewest numbers; empty without one
     covariance: FloatArray  #: of their changes, shape (p, p)
     #: Other explanations with as many numbers that these positions cannot distinguish from it.
     alternatives: tuple[tuple[GeometryEstimate, ...], ...]
-    every: tuple[GeometryEstimate, ...]  #: all numbers, estimated together; σ is infinite where it cannot be seen
-    unobservable: tuple[str, ...]  #: directions that no position shows, in words
+    #: All zeros and lengths, estimated together; σ is infinite where it cannot be seen.
+    every: tuple[GeometryEstimate, ...]
+    unobservable: tuple[str, ...]  #: directions of them that no position shows, in words
+
+    @property
+    def corrections(self) -> tuple[GeometryEstimate, ...]:
+        """Causes that can be corrected in the description: none where an encoder is late, or may be instead."""
+        for explanation in (self.causes, *self.alternatives):
+            if any(one.parameter.kind is GeometryKind.DELAY for one in explanation):
+                return ()
+        return self.causes
 
     @property
     def changes(self) -> tuple[GeometryChange, ...]:
@@ -94,14 +145,49 @@ class GeometryFinding:
 
 
 def thinned(run: Run) -> Positions:
-    """Choose positions of a run that are SPACING_S apart and valid on every axis."""
+    """Choose positions of a run that are SPACING_S apart, valid on every axis with the samples around them."""
+    position_rad = np.asarray(run.position_rad, dtype=np.float64)
+    time_s = np.asarray(run.time_s, dtype=np.float64)
+    samples, axes = position_rad.shape
     every = max(1, round(SPACING_S * run.rate_hz))
-    chosen = np.arange(0, len(run.time_s), every)
+    half = max(LEAST_WINDOW, round(WINDOW_S * run.rate_hz))
+    usable: BoolArray = np.ones(samples, dtype=np.bool_)
     if run.valid is not None:
-        chosen = chosen[np.asarray(run.valid)[chosen].all(axis=1)]
-    elapsed_s = np.asarray(run.time_s)[chosen] - run.time_s[0]
-    stretch = np.floor(elapsed_s / LONGEST_MOVE_S).astype(np.int64)
-    return Positions(run.name, np.asarray(run.position_rad, dtype=np.float64)[chosen], stretch)
+        usable = np.asarray(np.all(run.valid, axis=1))
+    chosen = np.arange(half, samples - half, every)
+    chosen = chosen[_all_around(usable, half)[chosen]]
+    around = np.arange(-half, half + 1)
+    interval_s = 1.0 / run.rate_hz
+    powers = np.vander(around * interval_s, DEGREE + 1, increasing=True)
+    fitting = np.linalg.pinv(powers)[1:]
+    motion = np.zeros((len(chosen), axes, DEGREE))
+    for offset, weight in zip(around, fitting.T, strict=True):
+        motion += position_rad[chosen + offset][:, :, None] * weight
+    return Positions(
+        run=run.name,
+        time_s=time_s[chosen],
+        position_rad=position_rad[chosen],
+        before_rad=position_rad[chosen - 1],
+        after_rad=position_rad[chosen + 1],
+        interval_s=interval_s,
+        motion=motion,
+        count_rad=np.array([_smallest_step(position_rad[usable, axis]) for axis in range(axes)]),
+    )
+
+
+def _all_around(usable: BoolArray, half: int) -> BoolArray:
+    """Whether all samples within half a window of each are usable, shape (k,)."""
+    unusable = np.concatenate(([0], np.cumsum(~usable)))
+    first = np.maximum(np.arange(len(usable)) - half, 0)
+    last = np.minimum(np.arange(len(usable)) + half + 1, len(usable))
+    return np.asarray(unusable[last] == unusable[first])
+
+
+def _smallest_step(values: FloatArray) -> float:
+    """Smallest difference between two values that is not rounding; zero without any."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > SMALLEST_COUNT_RAD]
+    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
 def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFinding | None:
@@ -119,26 +205,34 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
     """
     if not model.is_redundant:
         return None
-    axes_rad, stretch = _pooled(runs)
-    if len(axes_rad) < LEAST_POSITIONS or len(np.unique(stretch)) < 2:
+    count = sum(len(one.time_s) for one in runs)
+    if count < LEAST_POSITIONS:
         return None
-    problem = _Problem.of(model, axes_rad, stretch)
-    start = _whole(problem)
-    described = problem.misfit(np.zeros(len(problem.parameters)))
-    misfit = float(np.sqrt(np.mean(described**2) / problem.share))
-    chosen, fitted = _explained(problem, start)
-    found = chosen[0] if chosen else ()
-    corrections, covariance = _estimates(fitted, found)
-    left = float(np.sqrt(fitted.square_of(found or fitted.all_numbers) / problem.directions))
-    systematic = np.sqrt(max(fitted.square_of(()) - fitted.whole_square, 0.0) / problem.directions)
-    is_significant = bool(not fitted.passes(()) and systematic > SMALLEST_MISFIT)
-    if not is_significant:
-        corrections, covariance, chosen = (), np.zeros((0, 0)), []
+    directions = model.robot.axis_count - model.assembly.mobility
+    stride = -(-count * directions // MOST_ROWS)
+    problem = _Problem.of(model, [one.every(stride) for one in runs if len(one.time_s)])
+    as_described = np.zeros(len(problem.parameters))
+    described = problem.misfit(as_described)
+    misfit = float(np.sqrt(np.mean(described**2)))
+    square = float(described @ described)
+    is_significant = problem.excess(square, 0, problem.noise_std(as_described)) > SMALLEST_MISFIT
+    chosen: list[tuple[int, ...]] = []
+    causes: tuple[int, ...] = ()
+    left = misfit
+    if is_significant:
+        chosen, fitted = _explained(problem, _whole(problem))
+        causes = chosen[0] if chosen else ()
+        square = fitted.misfit_square_of(causes) if causes else fitted.square_of_description()
+        left = float(np.sqrt(square / problem.rows))
+    else:
+        fitted = _with_noise(problem, as_described)
+    estimates, covariance = _estimates(fitted, causes)
     return GeometryFinding(
         misfit=misfit,
-        misfit_left=left if is_significant else misfit,
+        misfit_left=left,
+        noise=fitted.noise_std,
         is_significant=is_significant,
-        corrections=corrections,
+        causes=estimates,
         covariance=covariance,
         alternatives=tuple(_estimates(fitted, other)[0] for other in chosen[1:]),
         every=fitted.every(),
@@ -146,169 +240,328 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
     )
 
 
-def _pooled(runs: Sequence[Positions]) -> tuple[FloatArray, IntArray]:
-    """Positions of all runs, at most MOST_POSITIONS, shape (k, m), and the stretch of each."""
-    stretches: list[IntArray] = []
-    last = 0
-    for one in runs:
-        stretches.append(one.stretch + last)
-        last += int(one.stretch.max(initial=-1)) + 1
-    axes_rad = np.concatenate([one.position_rad for one in runs])
-    every = -(-len(axes_rad) // MOST_POSITIONS)
-    return axes_rad[::every], np.concatenate(stretches)[::every]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
     """Recorded positions, and the poses with the described geometry from which others are near."""
 
     model: Model
-    parameters: tuple[GeometryParameter, ...]
-    unit: FloatArray  #: of each parameter: a radian, or the robot's size [m], shape (p,)
-    axes_rad: FloatArray  #: recorded, shape (k, m)
-    axis_unit: FloatArray  #: the same of each axis, shape (m,)
+    parameters: tuple[GeometryParameter, ...]  #: zeros and lengths, base places, delays
+    unit: FloatArray  #: of each: a radian, the robot's size [m], or the time for a radian [s], shape (p,)
+    runs: tuple[Positions, ...]
+    axis_unit: FloatArray  #: a radian, or the robot's size [m], of each axis, shape (m,)
     near_rad: FloatArray  #: of all joints, shape (k, n)
-    stretch: IntArray  #: of each sample, shape (k,)
+    basis: FloatArray  #: B, orthonormal: directions in which a misfit can be, shape (k, m, m − d)
 
     @classmethod
-    def of(cls, model: Model, axes_rad: FloatArray, stretch: IntArray) -> _Problem:
-        parameters = geometry_parameters(model.robot)
+    def of(cls, model: Model, runs: Sequence[Positions]) -> _Problem:
+        robot = model.robot
         size_m = model.assembly.size_m
-        kinds = [joint.kind for joint in model.robot.axes]
+        axis_unit = np.array([1.0 if joint.kind is JointKind.REVOLUTE else size_m for joint in robot.axes])
+        of_description = (*geometry_parameters(robot), *base_places(robot))
+        units = [unit_of(model, one) for one in of_description]
+        speed = np.concatenate([one.motion[:, :, 0] for one in runs]) / axis_unit
+        fastest = np.sqrt(np.mean(speed**2, axis=0))
+        units += [1.0 / max(float(one), SMALLEST_SINGULAR) for one in fastest]
+        axes_rad = np.concatenate([one.position_rad for one in runs])
+        near_rad = positions(robot, model.assembly, axes_rad)
         return cls(
             model=model,
-            parameters=parameters,
-            unit=np.array([unit_of(model, one) for one in parameters]),
-            axes_rad=axes_rad,
-            axis_unit=np.array([1.0 if kind is JointKind.REVOLUTE else size_m for kind in kinds]),
-            near_rad=positions(model.robot, model.assembly, axes_rad),
-            stretch=stretch,
+            parameters=(*of_description, *encoder_delays(robot)),
+            unit=np.array(units),
+            runs=tuple(runs),
+            axis_unit=axis_unit,
+            near_rad=near_rad,
+            basis=_misfit_directions(model, near_rad, axis_unit),
         )
 
     @property
-    def share(self) -> float:
-        """Share of the m numbers of a sample in which a misfit can be, (m − d)/m."""
-        motors = self.model.robot.axis_count
-        return (motors - self.model.assembly.mobility) / motors
+    def rows(self) -> int:
+        """Independent numbers in all misfits, k (m − d)."""
+        samples, _, directions = self.basis.shape
+        return int(samples * directions)
 
     @property
-    def directions(self) -> int:
-        """Independent numbers in all misfits, k (m − d)."""
-        return round(self.share * self.axes_rad.size)
+    def described(self) -> tuple[int, ...]:
+        """Indices of zeros and lengths."""
+        return tuple(range(len(geometry_parameters(self.model.robot))))
 
-    def misfit(self, changes: FloatArray) -> FloatArray:
-        """e with changes of all parameters in their units, shape (k m,)."""
-        return self._apart(self._closed(self._changed(changes)))
+    @property
+    def directions(self) -> list[RunDirections]:
+        """When and in which directions each run shows a misfit."""
+        ends = np.cumsum([len(one.time_s) for one in self.runs])
+        parts = np.split(self.basis, ends[:-1])
+        return [RunDirections(run.time_s, part) for run, part in zip(self.runs, parts, strict=True)]
+
+    def misfit(self, changes: FloatArray, offset: int = 0) -> FloatArray:
+        """e with changes of all parameters in their units, shape (k (m − d),).
+
+        ``offset`` -1 or 1 is for the samples before or after.
+        """
+        axes_rad = self._recorded(changes, offset)
+        return self._apart(axes_rad, self._closed(self._changed(changes), axes_rad))
+
+    def _recorded(self, changes: FloatArray, offset: int = 0) -> FloatArray:
+        """Positions of the axes, those of late encoders at the time of the others, shape (k, m)."""
+        delays_s = (changes * self.unit)[-self.model.robot.axis_count :]
+        parts: list[FloatArray] = []
+        for run in self.runs:
+            recorded = {-1: run.before_rad, 0: run.position_rad, 1: run.after_rad}[offset]
+            at_s = np.full(len(delays_s), offset * run.interval_s)
+            parts.append(recorded + _moved(run.motion, at_s + delays_s) - _moved(run.motion, at_s))
+        return np.concatenate(parts)
 
     def _changed(self, changes: FloatArray) -> Robot:
         """Robot with changes of all parameters in their units."""
         numbers = zip(self.parameters, changes * self.unit, strict=True)
-        return with_geometry(
-            self.model.robot, [GeometryChange(parameter, float(change)) for parameter, change in numbers]
-        )
+        described = [
+            GeometryChange(one, float(change)) for one, change in numbers if one.kind is not GeometryKind.DELAY
+        ]
+        return with_geometry(self.model.robot, described)
 
-    def _closed(self, robot: Robot) -> FloatArray:
+    def _closed(self, robot: Robot, axes_rad: FloatArray) -> FloatArray:
         """Poses of another geometry that fit the encoders best, shape (k, n)."""
-        return reach_near(robot, self.model.assembly, self.near_rad, self.axes_rad).position_rad
+        return reach_near(robot, self.model.assembly, self.near_rad, axes_rad).position_rad
 
-    def _apart(self, position_rad: FloatArray) -> FloatArray:
-        """e of poses, shape (k m,)."""
-        apart = self.axes_rad - position_rad[:, list(self.model.robot.axis_joints)]
-        return np.asarray((apart / self.axis_unit).ravel())
+    def _apart(self, axes_rad: FloatArray, position_rad: FloatArray) -> FloatArray:
+        """e of poses, shape (k (m − d),)."""
+        apart = axes_rad - position_rad[:, list(self.model.robot.axis_joints)]
+        return self._in_directions(apart)
 
-    def linearised(self, changes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """e and its derivatives to all parameters, in their units, shapes (k m,) and (k m, p).
+    def _in_directions(self, apart: FloatArray) -> FloatArray:
+        """Differences of the axes [rad or m], shape (k, m), in the directions of a misfit, shape (k (m − d),)."""
+        return np.asarray(np.einsum("kmr,km->kr", self.basis, apart / self.axis_unit).ravel())
 
-        With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, and a length by −P times what the motors' joints move where
-        x stays: J_d dq_d = −∂φ/∂θ. φ is linear in lengths, so that a difference of it is exact.
+    def linearised(self, changes: FloatArray, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """e and its derivatives to some parameters, in their units, shapes (k (m − d),) and (k (m − d), p).
+
+        With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, a delay by P e_j q̇_j, and a length or place by −P times what
+        the motors' joints move where x stays: J_d dq_d = −∂φ/∂θ. φ is linear in lengths and places, so that a
+        difference of it is exact.
         """
         robot = self._changed(changes)
         assembly = self.model.assembly
         motors = list(robot.axis_joints)
-        x = list(assembly.independent)
+        names = [joint.name for joint in robot.axes]
         rest = list(assembly.dependent)
-        position_rad = self._closed(robot)
+        axes_rad = self._recorded(changes)
+        position_rad = self._closed(robot, axes_rad)
         closing = loops(robot, position_rad, assembly.size_m)
-        q, r = np.linalg.qr(closing.jacobian[:, :, rest])
-        samples, _, joints = closing.jacobian.shape
-        to_joints = np.zeros((samples, joints, len(x)))
-        to_joints[:, x] = np.eye(len(x))
-        to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ closing.jacobian[:, :, x])
+        to_joints, q, r = _to_joints(self.model, closing.jacobian)
         onto = np.linalg.qr(to_joints[:, motors]).Q
         hidden = np.eye(len(motors)) - onto @ np.swapaxes(onto, 1, 2)
+        speed = np.concatenate([one.motion[:, :, 0] for one in self.runs])
         columns: list[FloatArray] = []
-        for parameter, unit in zip(self.parameters, self.unit, strict=True):
-            if parameter.kind is GeometryKind.ZERO:
-                axis = [joint.name for joint in robot.axes].index(parameter.joint)
-                column = hidden[:, :, axis]
-            else:
-                longer = with_geometry(robot, (GeometryChange(parameter, STEP * unit),))
-                gap = loops(longer, position_rad, assembly.size_m).residual - closing.residual
-                moved = np.zeros((samples, joints))
-                moved[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, gap)[..., None])[..., 0] / (STEP * unit)
-                column = -np.einsum("kij,kj->ki", hidden, moved[:, motors])
-            columns.append((unit * column / self.axis_unit).ravel())
-        return self._apart(position_rad), np.stack(columns, axis=1)
+        for index in chosen:
+            parameter = self.parameters[index]
+            unit = float(self.unit[index])
+            match parameter.kind:
+                case GeometryKind.ZERO:
+                    column = hidden[:, :, names.index(parameter.joint)]
+                case GeometryKind.DELAY:
+                    axis = names.index(parameter.joint)
+                    column = hidden[:, :, axis] * speed[:, [axis]]
+                case _:
+                    longer = with_geometry(robot, (GeometryChange(parameter, STEP * unit),))
+                    gap = loops(longer, position_rad, assembly.size_m).residual - closing.residual
+                    moved = np.zeros(position_rad.shape)
+                    moved[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, gap)[..., None])[..., 0]
+                    column = -np.einsum("kij,kj->ki", hidden, moved[:, motors]) / (STEP * unit)
+            columns.append(unit * self._in_directions(column))
+        return self._apart(axes_rad, position_rad), np.stack(columns, axis=1)
+
+    def noise_std(self, changes: FloatArray) -> float:
+        """σ of a misfit by what is known of the encoders, the larger of two.
+
+        One is by the second differences of e from sample to sample, which a smooth motion of what is left does not
+        reach; the other is that of rounding to counts, which an axis at rest shows in no difference.
+        """
+        earlier = self.misfit(changes, -1)
+        now = self.misfit(changes)
+        later = self.misfit(changes, 1)
+        by_differences = float(np.mean((earlier - 2.0 * now + later) ** 2)) / 6.0
+        counts = np.concatenate([np.tile(one.count_rad, (len(one.time_s), 1)) for one in self.runs])
+        share = np.sum(self.basis**2, axis=2) / self.basis.shape[2]
+        by_counts = float(np.mean(np.sum(share * (counts / self.axis_unit) ** 2, axis=1))) / 12.0
+        return float(np.sqrt(max(by_differences, by_counts)))
+
+    def excess(self, square: float, count: int, noise_std: float) -> float:
+        """Root mean square of a misfit beyond the known noise [rad, or of the robot's size].
+
+        Args:
+            square: Σe².
+            count: of the numbers that were estimated.
+            noise_std: of a misfit; each sample gives one difference, so that it is known as well as the misfit is.
+        """
+        free = self.rows - count
+        limit = float(scipy.stats.f.isf(PROBABILITY, free, self.rows))
+        return float(np.sqrt(max(square / free - limit * noise_std**2, 0.0)))
+
+
+def _moved(motion: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Motion from a position over a time of each axis, shape (m,): shape (k, m)."""
+    powers = time_s[:, None] ** np.arange(1, DEGREE + 1)
+    return np.asarray(np.einsum("kmn,mn->km", motion, powers))
+
+
+def _to_joints(model: Model, jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """G in each sample, shape (k, n, d), with Q and R of J_d."""
+    x = list(model.assembly.independent)
+    rest = list(model.assembly.dependent)
+    samples, _, joints = jacobian.shape
+    q, r = np.linalg.qr(jacobian[:, :, rest])
+    to_joints = np.zeros((samples, joints, len(x)))
+    to_joints[:, x] = np.eye(len(x))
+    to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ jacobian[:, :, x])
+    return to_joints, q, r
+
+
+def _misfit_directions(model: Model, position_rad: FloatArray, axis_unit: FloatArray) -> FloatArray:
+    """Orthonormal directions of the axes in which no motion goes, in their units, shape (k, m, m − d)."""
+    closing = loops(model.robot, position_rad, model.assembly.size_m)
+    to_joints, _, _ = _to_joints(model, closing.jacobian)
+    to_motors = to_joints[:, list(model.robot.axis_joints)]
+    mobility = model.assembly.mobility
+    hidden = np.linalg.qr(to_motors, mode="complete").Q[:, :, mobility:]
+    return np.asarray(np.linalg.qr(hidden / axis_unit[:, None]).Q)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Linearised:
-    """e ≈ J θ − y around an estimate, reduced to a triangle, and the noise of all numbers together."""
+class _Visible:
+    """Directions of some parameters that the positions show."""
 
-    problem: _Problem
-    triangle: FloatArray  #: R of [J | y], shape (p + 1, p + 1)
-    singular: FloatArray  #: singular values of J, shape (p,)
+    singular: FloatArray  #: singular values of their white columns, shape (p,)
     ways: FloatArray  #: right singular vectors, a row each, shape (p, p)
     seen: int  #: how many of them these positions show
-    variance: FloatArray  #: σ² of a misfit, correlation included, shape ()
-    whole_square: float  #: Σe² with all that is seen estimated
 
     @classmethod
-    def at(cls, problem: _Problem, changes: FloatArray) -> _Linearised:
-        misfit, jacobian = problem.linearised(changes)
-        right = jacobian @ changes - misfit
-        left, singular, ways = np.linalg.svd(jacobian, full_matrices=False)
-        seen = int(np.sum(singular > SMALLEST_SINGULAR * singular[0]))
+    def of(cls, columns: FloatArray, variance: float, largest_std: float) -> _Visible:
+        """Those that are known to some σ."""
+        _, singular, ways = np.linalg.svd(columns, full_matrices=False)
+        is_real = singular > SMALLEST_SINGULAR * singular[0]
+        is_known = np.sqrt(variance) < largest_std * singular
+        return cls(singular, ways, int(np.sum(is_real & is_known)))
+
+    def estimate(self, columns: FloatArray, right: FloatArray) -> FloatArray:
+        """Least squares of what is seen; the rest stays as it is described."""
+        ways = self.ways[: self.seen].T
+        return np.asarray(ways @ np.linalg.lstsq(columns @ ways, right, rcond=None)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """e ≈ J θ − y around an estimate, reduced to triangles, and the noise of all numbers together."""
+
+    problem: _Problem
+    jacobian: FloatArray  #: J, shape (k (m − d), p)
+    right: FloatArray  #: y, shape (k (m − d),)
+    noise: MisfitNoise | None  #: correlation by which the rows were made white; None before it is known
+    noise_std: float  #: of a misfit, by what is known of the encoders
+    triangle: FloatArray  #: R of the white [J | y], shape (p + 1, p + 1)
+    misfit_triangle: FloatArray  #: R of [J | y], shape (p + 1, p + 1)
+    visible: _Visible  #: of all parameters
+    variance: FloatArray  #: σ² of a white row, shape ()
+    whole_square: float  #: Σ of the white e² with all that is seen estimated
+
+    @classmethod
+    def at(cls, problem: _Problem, changes: FloatArray, noise: MisfitNoise | None, noise_std: float) -> _Linearised:
+        """Linearise around changes of all parameters in their units."""
+        misfit, jacobian = problem.linearised(changes, range(len(problem.parameters)))
+        return cls.of(problem, jacobian, jacobian @ changes - misfit, noise, noise_std)
+
+    @classmethod
+    def of(
+        cls, problem: _Problem, jacobian: FloatArray, right: FloatArray, noise: MisfitNoise | None, noise_std: float
+    ) -> _Linearised:
+        """Reduce a linear problem."""
+        rows = np.column_stack((jacobian, right))
+        white = rows if noise is None else noise.white(rows)
+        triangle = np.asarray(np.linalg.qr(white, mode="r"))
+        columns = triangle[:, :-1]
+        variance = 0.0
+        visible = _Visible.of(columns, variance, TESTED_STD)
+        square = 0.0
         while True:
-            onto = left[:, :seen]
-            residual = right - onto @ (onto.T @ right)
-            square = float(residual @ residual)
-            variance = square / max(problem.directions - seen, 1)
-            variance *= _correlation(problem, onto, residual, variance)
-            visible = int(np.sum(np.sqrt(variance) < LARGEST_STD * singular[:seen]))
-            if visible == seen:
+            left = triangle[:, -1] - columns @ visible.estimate(columns, triangle[:, -1])
+            square = float(left @ left)
+            variance = square / max(problem.rows - visible.seen, 1)
+            new = _Visible.of(columns, variance, TESTED_STD)
+            if new.seen >= visible.seen:
                 break
-            seen = visible
-        triangle = np.asarray(np.linalg.qr(np.column_stack((jacobian, right)), mode="r"))
-        return cls(problem, triangle, singular, ways, seen, np.asarray(variance), square)
+            visible = new
+        return cls(
+            problem=problem,
+            jacobian=jacobian,
+            right=right,
+            noise=noise,
+            noise_std=noise_std,
+            triangle=triangle,
+            misfit_triangle=np.asarray(np.linalg.qr(rows, mode="r")),
+            visible=visible,
+            variance=np.asarray(variance),
+            whole_square=square,
+        )
+
+    def moved_to(self, changes: FloatArray) -> _Linearised:
+        """Take the misfit of other changes, with the derivatives from here: they differ by the size of the changes."""
+        right = self.jacobian @ changes - self.problem.misfit(changes)
+        return _Linearised.of(self.problem, self.jacobian, right, self.noise, self.noise_std)
 
     @property
-    def all_numbers(self) -> tuple[int, ...]:
-        """Indices of all parameters."""
-        return tuple(range(len(self.problem.parameters)))
+    def _columns(self) -> FloatArray:
+        return self.triangle[:, :-1]
+
+    @property
+    def _right(self) -> FloatArray:
+        return self.triangle[:, -1]
+
+    @cached_property
+    def candidates(self) -> tuple[int, ...]:
+        """Indices of the parameters that alone change a misfit."""
+        length = np.linalg.norm(self._columns, axis=0)
+        return tuple(int(index) for index in np.flatnonzero(np.sqrt(self.variance) < TESTED_STD * length))
+
+    def whole(self) -> FloatArray:
+        """All changes as far as they are seen, in their units."""
+        return self.visible.estimate(self._columns, self._right)
 
     def solution(self, chosen: Sequence[int]) -> FloatArray:
-        """The chosen changes that leave the least misfit, in their units."""
-        return np.asarray(np.linalg.lstsq(self.triangle[:, list(chosen)], self.triangle[:, -1], rcond=None)[0])
+        """The chosen changes that leave the least white misfit, in their units."""
+        columns = self._columns[:, list(chosen)]
+        return np.asarray(np.linalg.lstsq(columns, self._right, rcond=None)[0])
 
     def square_of(self, chosen: Sequence[int]) -> float:
-        """Σe² that is left when only these numbers change."""
-        if len(chosen) == len(self.problem.parameters):
-            return self.whole_square
-        left = self.triangle[:, -1]
+        """Σ of the white e² that is left when only these numbers change."""
+        left = self._right
         if chosen:
-            left = left - self.triangle[:, list(chosen)] @ self.solution(chosen)
+            left = left - self._columns[:, list(chosen)] @ self.solution(chosen)
         return float(left @ left)
 
-    def passes(self, chosen: Sequence[int]) -> bool:
-        """Whether these numbers alone explain the misfit as well as all that can be seen."""
-        others = self.seen - len(chosen)
-        if others <= 0:
-            return True
+    def misfit_square_of(self, chosen: Sequence[int]) -> float:
+        """Σe² that is left when only these numbers change."""
+        left = self.misfit_triangle[:, -1]
+        if chosen:
+            left = left - self.misfit_triangle[:, list(chosen)] @ self.solution(chosen)
+        return float(left @ left)
+
+    def square_of_description(self) -> float:
+        """Σe² that is left when all zeros and lengths change."""
+        columns = self.misfit_triangle[:, list(self.problem.described)]
+        right = self.misfit_triangle[:, -1]
+        left = right - columns @ np.linalg.lstsq(columns, right, rcond=SMALLEST_SINGULAR)[0]
+        return float(left @ left)
+
+    def explains(self, chosen: Sequence[int]) -> bool:
+        """Whether these numbers alone leave no more than all that can be seen, and no more than noise."""
+        seen = self.visible.seen
+        others = max(seen - len(chosen), 1)
         excess = (self.square_of(chosen) - self.whole_square) / others
-        stretches = len(np.unique(self.problem.stretch))
-        limit = float(scipy.stats.f.isf(PROBABILITY, others, stretches - 1))
-        return bool(excess <= limit * self.variance)
+        independent = self.problem.rows if self.noise is None else self.noise.effective
+        limit = float(scipy.stats.f.isf(PROBABILITY, others, max(independent - seen, 1.0)))
+        if excess > limit * self.variance:
+            return False
+        excess = self.problem.excess(self.misfit_square_of(chosen), len(chosen), self.noise_std)
+        described = float(np.sqrt(self.misfit_square_of(()) / self.problem.rows))
+        return excess <= min(TOLERATED_MISFIT, TOLERATED_SHARE * described)
 
     def covariance(self, chosen: Sequence[int]) -> FloatArray:
         """Covariance of the chosen changes, in their units."""
@@ -316,92 +569,89 @@ class _Linearised:
         inverse = np.linalg.inv(upper)
         return np.asarray(self.variance * (inverse @ inverse.T))
 
+    @cached_property
+    def _description(self) -> _Visible:
+        """Directions of zeros and lengths."""
+        columns = self._columns[:, list(self.problem.described)]
+        return _Visible.of(columns, float(self.variance), LARGEST_STD)
+
     def every(self) -> tuple[GeometryEstimate, ...]:
-        """All numbers estimated together, as far as they are seen."""
-        ways = self.ways[: self.seen].T
-        scaled = np.linalg.lstsq(self.triangle[:, :-1] @ ways, self.triangle[:, -1], rcond=None)[0]
-        values = ways @ scaled
-        variance = self.variance * np.sum((ways / self.singular[: self.seen]) ** 2, axis=1)
-        hidden = np.sum(self.ways[self.seen :] ** 2, axis=0) > SMALLEST_SINGULAR
-        std = np.where(hidden, np.inf, np.sqrt(variance))
-        unit = self.problem.unit
-        numbers = zip(self.problem.parameters, values * unit, std * unit, strict=True)
+        """All zeros and lengths estimated together, as far as they are seen."""
+        described = list(self.problem.described)
+        columns = self._columns[:, described]
+        visible = self._description
+        values = visible.estimate(columns, self._right)
+        ways = visible.ways[: visible.seen].T
+        left = self._right - columns @ values
+        variance = float(left @ left) / max(self.problem.rows - visible.seen, 1)
+        variances = variance * np.sum((ways / visible.singular[: visible.seen]) ** 2, axis=1)
+        hidden = np.sum(visible.ways[visible.seen :] ** 2, axis=0) > SMALLEST_SINGULAR
+        std = np.where(hidden, np.inf, np.sqrt(variances))
+        unit = self.problem.unit[described]
+        numbers = zip(self.problem.parameters[: len(described)], values * unit, std * unit, strict=True)
         return tuple(GeometryEstimate(parameter, float(value), float(one)) for parameter, value, one in numbers)
 
     def unobservable(self) -> tuple[str, ...]:
         """Directions that the positions do not show, by the numbers that have the largest part in them."""
-        return tuple(self._direction(way) for way in self.ways[self.seen :])
+        visible = self._description
+        return tuple(self._direction(way) for way in visible.ways[visible.seen :])
 
     def _direction(self, way: FloatArray) -> str:
         largest = np.abs(way).max()
+        described = self.problem.parameters[: len(way)]
         parts = [
             f"{share:+.2f} {parameter.name}"
-            for share, parameter in zip(way, self.problem.parameters, strict=True)
+            for share, parameter in zip(way, described, strict=True)
             if abs(share) > 0.1 * largest
         ]
         return ", ".join(parts)
 
 
-def _correlation(problem: _Problem, onto: FloatArray, residual: FloatArray, variance: float) -> float:
-    """How much more the sums over stretches scatter than those of independent samples, at least 1.
-
-    Args:
-        problem: with the stretches.
-        onto: orthonormal basis of the columns, shape (k m, r): the sums are those that an estimate is made of.
-        residual: e of the estimate, shape (k m,).
-        variance: σ² of independent misfits.
-    """
-    if variance == 0.0:
-        return 1.0
-    stretch = np.repeat(problem.stretch, problem.model.robot.axis_count)
-    _, index = np.unique(stretch, return_inverse=True)
-    count = int(index.max()) + 1
-    sums = np.zeros((count, onto.shape[1]))
-    np.add.at(sums, index, onto * residual[:, None])
-    scatter = np.sum(sums**2, axis=0) * count / (count - 1)
-    return float(max(1.0, np.mean(scatter) / variance))
-
-
 def _whole(problem: _Problem) -> _Linearised:
     """Linearise around the estimate of all numbers; directions that are not seen stay as they are described."""
-    changes = np.zeros(len(problem.parameters))
-    fitted = _Linearised.at(problem, changes)
+    as_described = np.zeros(len(problem.parameters))
+    near = _settled(_Linearised.at(problem, as_described, None, 0.0), as_described)
+    fitted = _with_noise(problem, near.whole())
+    return _settled(fitted, fitted.whole())
+
+
+def _with_noise(problem: _Problem, changes: FloatArray) -> _Linearised:
+    """Linearise near an estimate, with the noise that is left there."""
+    fitted = _Linearised.at(problem, changes, None, problem.noise_std(changes))
+    ways = fitted.visible.ways[: fitted.visible.seen].T
+    noise = estimate_noise(problem.directions, fitted.jacobian @ ways, fitted.right)
+    return _Linearised.of(problem, fitted.jacobian, fitted.right, noise, fitted.noise_std)
+
+
+def _settled(start: _Linearised, changes: FloatArray) -> _Linearised:
+    """Estimate all numbers by Gauss-Newton, with the derivatives where it starts."""
+    fitted = start
     for _ in range(ITERATIONS):
-        ways = fitted.ways[: fitted.seen].T
-        seen_part = np.linalg.lstsq(fitted.triangle[:, :-1] @ ways, fitted.triangle[:, -1], rcond=None)[0]
-        new = ways @ seen_part
-        step = float(np.max(np.abs(new - changes)))
+        new = fitted.whole()
+        step = float(np.linalg.norm(fitted.triangle[:, :-1] @ (new - changes)))
         changes = new
-        fitted = _Linearised.at(problem, changes)
-        if step < SETTLED + 1e-3 * np.sqrt(float(fitted.variance)):
+        fitted = fitted.moved_to(changes)
+        if step < SETTLED + SETTLED_SIGMAS * np.sqrt(float(fitted.variance)):
             break
     return fitted
 
 
 def _explained(problem: _Problem, start: _Linearised) -> tuple[list[tuple[int, ...]], _Linearised]:
     """Choices of the fewest numbers that explain the misfit, the best first, linearised around the best of them."""
-    fitted = start
-    chosen: list[tuple[int, ...]] = []
-    if start.passes(()):
-        return chosen, fitted
-    for _ in range(MOST_CAUSES):
-        before = chosen[:1]
-        chosen = [*_fewest(fitted)]
-        if not chosen or chosen[:1] == before:
-            break
-        fitted = _Linearised.at(problem, _refined(problem, fitted, chosen[0]))
-    return chosen, fitted
-
-
-def _fewest(fitted: _Linearised) -> Iterator[tuple[int, ...]]:
-    """Yield the smallest choices that pass, the best first; none where only all numbers together would."""
     for size in range(1, MOST_CAUSES + 1):
-        passed = [one for one in combinations(fitted.all_numbers, size) if fitted.passes(one)]
-        if passed:
-            yield from sorted(passed, key=fitted.square_of)
-            return
-    if fitted.seen == len(fitted.all_numbers):
-        yield fitted.all_numbers
+        fitted = start
+        best: tuple[int, ...] = ()
+        # What is best is known after it was estimated itself: all numbers together are elsewhere.
+        for _ in range(MOST_TURNS):
+            ranked = sorted(combinations(fitted.candidates, size), key=fitted.square_of)
+            if not ranked or ranked[0] == best:
+                break
+            best = ranked[0]
+            fitted = start.moved_to(_refined(problem, fitted, best))
+        if best and fitted.explains(best):
+            others = [one for one in combinations(fitted.candidates, size) if one != best and fitted.explains(one)]
+            return [best, *sorted(others, key=fitted.square_of)], fitted
+    return [], start
 
 
 def _refined(problem: _Problem, fitted: _Linearised, chosen: tuple[int, ...]) -> FloatArray:
@@ -409,8 +659,10 @@ def _refined(problem: _Problem, fitted: _Linearised, chosen: tuple[int, ...]) ->
     changes = np.zeros(len(problem.parameters))
     changes[list(chosen)] = fitted.solution(chosen)
     for _ in range(ITERATIONS):
-        misfit, jacobian = problem.linearised(changes)
-        step = -np.linalg.lstsq(jacobian[:, list(chosen)], misfit, rcond=None)[0]
+        misfit, jacobian = problem.linearised(changes, chosen)
+        rows = np.column_stack((jacobian, misfit))
+        white = rows if fitted.noise is None else fitted.noise.white(rows)
+        step = -np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
         changes[list(chosen)] += step
         if float(np.max(np.abs(step))) < SETTLED:
             break

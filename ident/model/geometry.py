@@ -1,8 +1,9 @@
-"""What a description may have wrong of a closed chain's geometry: zeros of driven joints, and lengths of links.
+"""What a description may have wrong of a closed chain: zeros of driven joints, lengths of links, places on the base.
 
 A parameter is a number that the description gives; its change is what has to be added to that number. The zero of a
-joint is added to all of its recorded positions (`zero_offset_deg` of the cell file), and a length is the distance from
-the origin of a link's joint to the next joint, or to the frame that closes a loop, along the described direction.
+joint is added to all of its recorded positions (`zero_offset_deg` of the cell file). A length is the distance from
+the origin of a link's joint to the next joint, or to the frame that closes a loop, along the described direction. A
+place is a coordinate of a joint's origin on the base.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.robot import Closure, Joint, JointKind, Place, Robot, skew
 
+DIRECTIONS = ("x", "y", "z")  #: Axes of the base
 SHORTEST_LENGTH_M = 1e-6  #: Origins that are closer to each other have no direction along which to be wrong
 
 
@@ -25,6 +27,8 @@ class GeometryKind(Enum):
 
     ZERO = "zero"  #: of a driven joint [rad; m of a prismatic joint]
     LENGTH = "length"  #: of a link, between two points of it [m]
+    PLACE = "place"  #: coordinate of a joint on the base, in the axes of the base [m]
+    DELAY = "delay"  #: of a joint's encoder behind the others [s], which is no number of the description
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +36,22 @@ class GeometryParameter:
     """One number of a robot's description."""
 
     kind: GeometryKind
-    joint: str  #: name of the joint: the one with the zero, or the one that moves the link
-    end: str = ""  #: of a length: name of the joint or of the closure at the other end of the link
+    joint: str  #: name of the joint: the one with the zero, on the base, or late, or the one that moves the link
+    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x, y or z.
+    end: str = ""
 
     @property
     def name(self) -> str:
         """Name for messages, as `zero of crank-1` or `length from crank-1 to elbow-1`."""
-        return f"zero of {self.joint}" if self.kind is GeometryKind.ZERO else f"length from {self.joint} to {self.end}"
+        match self.kind:
+            case GeometryKind.ZERO:
+                return f"zero of {self.joint}"
+            case GeometryKind.LENGTH:
+                return f"length from {self.joint} to {self.end}"
+            case GeometryKind.PLACE:
+                return f"{self.end} of {self.joint} on the base"
+            case GeometryKind.DELAY:
+                return f"delay of the encoder of {self.joint}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +71,17 @@ def geometry_parameters(robot: Robot) -> tuple[GeometryParameter, ...]:
     return (*zeros, *_lengths(robot))
 
 
+def base_places(robot: Robot) -> tuple[GeometryParameter, ...]:
+    """Return the coordinates of all joints on the base."""
+    on_base = [joint.name for joint in robot.joints if joint.parent < 0]
+    return tuple(GeometryParameter(GeometryKind.PLACE, name, axis) for name in on_base for axis in DIRECTIONS)
+
+
+def encoder_delays(robot: Robot) -> tuple[GeometryParameter, ...]:
+    """Return the delays of the encoders, in the order of the axes; `with_geometry` knows none of them."""
+    return tuple(GeometryParameter(GeometryKind.DELAY, joint.name) for joint in robot.axes)
+
+
 def _lengths(robot: Robot) -> Iterator[GeometryParameter]:
     for joint in robot.joints:
         if joint.parent >= 0 and np.linalg.norm(joint.translation_m) > SHORTEST_LENGTH_M:
@@ -69,11 +93,14 @@ def _lengths(robot: Robot) -> Iterator[GeometryParameter]:
 
 
 def described_length(robot: Robot, parameter: GeometryParameter) -> float:
-    """Return a length as it is described [m].
+    """Return a length, or a place, as it is described [m].
 
     Raises:
-        ModelError: the robot has no such link.
+        ModelError: the robot has no such link or joint.
     """
+    if parameter in base_places(robot):
+        joint = robot.joints[_joint_number(robot, parameter.joint)]
+        return float(joint.translation_m[DIRECTIONS.index(parameter.end)])
     for joint in robot.joints:
         if _is_end(robot, parameter, joint.parent, joint.name):
             return float(np.linalg.norm(joint.translation_m))
@@ -85,7 +112,7 @@ def described_length(robot: Robot, parameter: GeometryParameter) -> float:
 
 
 def with_geometry(robot: Robot, changes: Iterable[GeometryChange]) -> Robot:
-    """Return the robot with other zeros and lengths.
+    """Return the robot with other zeros, lengths and places.
 
     Its joints' positions are those that are recorded, so a zero turns the frame of its joint.
 
@@ -97,24 +124,41 @@ def with_geometry(robot: Robot, changes: Iterable[GeometryChange]) -> Robot:
         ModelError: the robot has no such joint or link.
     """
     changed = robot
-    known = set(geometry_parameters(robot))
+    known = {*geometry_parameters(robot), *base_places(robot)}
     for one in changes:
         if one.parameter not in known:
             raise _unknown(robot, one.parameter)
-        if one.parameter.kind is GeometryKind.ZERO:
-            changed = _with_zero(changed, one.parameter.joint, one.change)
-        else:
-            changed = _with_length(changed, one.parameter, one.change)
+        match one.parameter.kind:
+            case GeometryKind.ZERO:
+                changed = _with_zero(changed, one.parameter.joint, one.change)
+            case GeometryKind.PLACE:
+                changed = _with_place(changed, one.parameter, one.change)
+            case _:
+                changed = _with_length(changed, one.parameter, one.change)
     return changed
 
 
 def _unknown(robot: Robot, parameter: GeometryParameter) -> ModelError:
-    names = ", ".join(one.name for one in geometry_parameters(robot))
+    known = (*geometry_parameters(robot), *base_places(robot))
+    names = ", ".join(one.name for one in known)
     return ModelError(f"the robot has no {parameter.name}; expected one of: {names}")
 
 
+def _joint_number(robot: Robot, name: str) -> int:
+    return [joint.name for joint in robot.joints].index(name)
+
+
+def _with_place(robot: Robot, parameter: GeometryParameter, change_m: float) -> Robot:
+    number = _joint_number(robot, parameter.joint)
+    joint = robot.joints[number]
+    place_m = joint.translation_m.copy()
+    place_m[DIRECTIONS.index(parameter.end)] += change_m
+    moved = replace(joint, translation_m=place_m)
+    return replace(robot, joints=(*robot.joints[:number], moved, *robot.joints[number + 1 :]))
+
+
 def _with_zero(robot: Robot, name: str, change: float) -> Robot:
-    number = next(index for index, joint in enumerate(robot.joints) if joint.name == name)
+    number = _joint_number(robot, name)
     joint = robot.joints[number]
     if joint.kind is JointKind.REVOLUTE:
         moved = replace(joint, rotation=joint.rotation @ _turn(joint.axis, change))

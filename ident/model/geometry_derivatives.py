@@ -21,7 +21,7 @@ torque, and rounding in poses that are closed to 1e-12 is as small."""
 
 
 def model_with_geometry(model: Model, changes: Iterable[GeometryChange]) -> Model:
-    """Return the model of a robot with other zeros and lengths.
+    """Return the model of a robot with other zeros, lengths and places.
 
     Raises:
         ModelError: the robot has no such joint or link, or its loops do not close with them.

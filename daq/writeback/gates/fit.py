@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from daq.workflow.geometry_diagnoses import LOOK_FOR, UNEXPLAINED, misfit_text
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
@@ -22,7 +23,7 @@ CORRECTED_BY = {"zero-off": "zero-offset", "gravity-tilted": "gravity-direction"
 """Diagnosis of the description, and the effect that corrects it in a calibration."""
 NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed", "zero-turned"})
 """Diagnoses of a description that is so far off that nothing in a calibration corrects it."""
-BY_ENCODERS = frozenset({"zero-off", "length-off", "geometry-off"})
+BY_ENCODERS = frozenset({"zero-off", "length-off", "place-off", "geometry-off"})
 """Diagnoses by encoders that miss the loops of a closed chain."""
 
 
@@ -61,6 +62,21 @@ def description(context: GateContext) -> Iterator[GateFinding]:
     for diagnosis in uncorrected_description(calibration):
         subject = ", ".join(diagnosis.axes) or "calibration"
         yield subject, diagnosis.found, diagnosis.expected, diagnosis.remedy
+
+
+def encoders(context: GateContext) -> Iterator[GateFinding]:
+    """Bound the misfit of redundant encoders that no number of the description explains."""
+    misfit = context.calibration.encoder_misfit
+    if misfit is None or not misfit.significant or misfit.corrections or misfit.late_encoders:
+        return
+    limit = 1e-3 * context.policy.max_encoder_misfit_mrad
+    if not misfit.described <= limit:
+        yield (
+            "calibration",
+            f"encoders that miss the loops by {misfit_text(misfit.described, misfit.unit)}, which {UNEXPLAINED}",
+            f"at most {misfit_text(limit, misfit.unit)} (`max_encoder_misfit_mrad`)",
+            LOOK_FOR,
+        )
 
 
 def uncorrected_description(calibration: Calibration) -> tuple[Diagnosis, ...]:

@@ -37,8 +37,9 @@ GATES: tuple[GateRow, ...] = (
     GateRow(Gate.CONFIGURATION, (fit.configuration,), "record again, or review and pass `--configuration-changed`"),
     GateRow(
         Gate.DESCRIPTION,
-        (fit.description,),
+        (fit.description, fit.encoders),
         "correct the cell file and fit again, or let `drivegain residual` correct it",
+        f"`max_encoder_misfit_mrad: {_LIMITS.max_encoder_misfit_mrad:g}` of encoders that nothing explains",
     ),
     GateRow(Gate.NOT_FINITE, (fit.finite_errors, target.finite_gains), "fit again"),
     GateRow(Gate.HOLDOUT_STILL, (fit.holdout_motion,), "hold out a run in which all axes move"),

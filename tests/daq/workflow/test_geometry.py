@@ -19,6 +19,7 @@ from daq.log.reader import LossyLogs
 from daq.report.certificate import certificate_report, certify
 from daq.report.comparison import without_controller
 from daq.report.document import json_tree
+from daq.report.gains import encoder_text
 from daq.workflow import fit as fitting
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit, with_corrected_geometry
 from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
@@ -263,9 +264,9 @@ def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: F
     assert shift_in_sigmas(many, clean.estimate) == pytest.approx(3.0)
 
 
-def _finding(*corrections: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...]) -> GeometryFinding:
-    covariance = np.diag([one.std**2 for one in corrections]) if corrections else np.zeros((0, 0))
-    return GeometryFinding(4e-4, 5e-6, True, corrections, covariance, alternatives, (), ())
+def _finding(*causes: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...] = ()) -> GeometryFinding:
+    covariance = np.diag([one.std**2 for one in causes])
+    return GeometryFinding(4e-4, 6e-6, 5e-6, True, causes, covariance, alternatives, (), ())
 
 
 def test_what_encoders_cannot_tell_apart_is_said() -> None:
@@ -273,13 +274,70 @@ def test_what_encoders_cannot_tell_apart_is_said() -> None:
     (one,) = geometry_diagnoses(_finding(zero, alternatives=((rod,),)), CELL, applied=False)
     assert one.name == "zero-off"
     assert "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter" in one.found
-    (both,) = geometry_diagnoses(_finding(zero, rod, alternatives=()), CELL, applied=False)
+    (both,) = geometry_diagnoses(_finding(zero, rod), CELL, applied=False)
     assert (both.name, both.axes) == ("geometry-off", ("crank-2",))
     assert "explain together" in both.found
-    (none,) = geometry_diagnoses(_finding(alternatives=()), CELL, applied=False)
-    assert none.name == "geometry-off"
-    assert "no three zeros or lengths explain" in none.found
     kept = encoder_misfit_of(_finding(zero, alternatives=((rod,),)), CELL, applied=True)
     assert kept is not None
     assert kept.alternatives == ("a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter than described",)
     assert list(geometry_diagnoses(None, CELL, applied=False)) == []
+
+
+def test_a_misfit_that_nothing_explains_is_called_so() -> None:
+    (none,) = geometry_diagnoses(_finding(), CELL, applied=False)
+    assert none.name == "geometry-off"
+    assert "miss the loops by 0.4 mrad, which no zero, length, place on the base or late encoder explains" in none.found
+    assert none.expected == "0.005 mrad, the noise of the encoders"
+    assert "arms that bend, play in joints" in none.remedy
+    kept = encoder_misfit_of(_finding(), CELL, applied=False)
+    assert kept is not None
+    text = encoder_text(kept)
+    assert "miss the loops by 0.4 mrad, where their noise is 0.005 mrad, which no zero, length" in text
+    assert "all zeros and lengths together leave 0.006 mrad" in text
+
+
+def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -> None:
+    late = GeometryEstimate(GeometryParameter(GeometryKind.DELAY, "crank-2"), 0.003, 1e-6)
+    (one,) = geometry_diagnoses(_finding(late), CELL, applied=False)
+    assert (one.name, one.axes) == ("position-late", ("crank-2",))
+    assert "an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms explains alone" in one.found
+    assert "look for what delays the encoder of crank-2" in one.remedy
+    assert "residual" not in one.remedy
+    fitted = replace(clean, geometry=_finding(late))
+    assert with_corrected_geometry(fitted) is fitted
+    calibration = calibration_of(fitted, RECORDED)
+    save_calibration(calibration, tmp_path / "calibration.yaml")
+    kept = load_calibration(tmp_path / "calibration.yaml").encoder_misfit
+    assert kept == calibration.encoder_misfit
+    assert kept is not None
+    assert (kept.corrections, kept.noise) == ((), 5e-6)
+    assert "explained by an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms" in encoder_text(kept)
+
+
+def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
+    zero = GeometryEstimate(ZERO, 1e-3, 1e-5)
+    late = GeometryEstimate(GeometryParameter(GeometryKind.DELAY, "crank-2"), 0.003, 1e-6)
+    finding = _finding(zero, alternatives=((late,),))
+    assert finding.corrections == ()
+    kept = encoder_misfit_of(finding, CELL, applied=False)
+    assert kept is not None
+    assert "explained by the zero of crank-2" in encoder_text(kept)
+    assert "; or by an encoder of crank-2" in encoder_text(kept)
+
+
+def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) -> None:
+    place = GeometryEstimate(GeometryParameter(GeometryKind.PLACE, "crank-3", "y"), -3e-4, 1e-7)
+    finding = _finding(place)
+    (one,) = geometry_diagnoses(finding, CELL, applied=False)
+    assert (one.name, one.axes) == ("place-off", ())
+    assert "the place of crank-3 on the base off by -0.3000 ± 0.0001 mm in y (to be added to it) explains alone" in one.found
+    joints = {joint.name: joint for joint in model_of(CELL).robot.joints}
+    described_mm = 1e3 * float(joints["crank-3"].translation_m[1])
+    assert f"{described_mm - 0.3:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
+    calibration = calibration_of(replace(clean, geometry=finding, geometry_covariance=np.zeros((1, 1))), RECORDED)
+    save_calibration(calibration, tmp_path / "calibration.yaml")
+    read = load_calibration(tmp_path / "calibration.yaml")
+    moved = {joint.name: joint for joint in calibrated_model(read, CELL).robot.joints}
+    assert moved["crank-3"].translation_m[1] == pytest.approx(1e-3 * described_mm - 3e-4)
+    assert read.encoder_misfit is not None
+    assert "the place of crank-3 in y -0.3000 ± 0.0001 mm" in encoder_text(read.encoder_misfit)

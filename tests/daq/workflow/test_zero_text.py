@@ -48,7 +48,7 @@ def _by_encoders(value_rad: float) -> GeometryFinding:
     """A finding by redundant encoders, of the second axis of a closed chain."""
     parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
     correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
-    return GeometryFinding(4e-4, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ())
+    return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ())
 
 
 @pytest.mark.parametrize("too_large_deg", DECLARED_TOO_LARGE_DEG)

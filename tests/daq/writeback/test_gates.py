@@ -185,6 +185,18 @@ def _by_encoders(*, applied: bool) -> Callable[[Scene], Scene]:
     return _calibration(encoder_misfit=misfit, diagnoses=(diagnosis_named("zero-off", "J2"),))
 
 
+def _unexplained(misfit: float, noise: float | None = 5e-6) -> Callable[[Scene], Scene]:
+    """Encoders of a closed chain that miss the loops without an explanation."""
+    found = EncoderMisfit(misfit, 2e-5, "rad", True, (), False, noise=noise)
+    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("geometry-off"),))
+
+
+def _late_encoder(scene: Scene) -> Scene:
+    """An encoder of a closed chain that is late: its diagnosis refuses, whatever the size of the misfit."""
+    found = EncoderMisfit(2e-3, 5e-6, "rad", True, (), False, noise=5e-6, late_encoders="an encoder of J2")
+    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("position-late", "J2"),))(scene)
+
+
 def _diagnosed(*diagnoses: Diagnosis) -> Callable[[Scene], Scene]:
     return _calibration(diagnoses=diagnoses)
 
@@ -351,6 +363,9 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.DESCRIPTION, "J2", _diagnosed(diagnosis_named("zero-off", "J2"))),
     (Gate.DESCRIPTION, "J2", _corrected("zero-offset", diagnosis_named("zero-off", "J2"))),  # corrects that of J3
     (Gate.DESCRIPTION, "J2", _by_encoders(applied=False)),
+    (Gate.DESCRIPTION, "calibration", _unexplained(1.001e-4)),
+    (Gate.DESCRIPTION, "calibration", _unexplained(1e-3, noise=None)),
+    (Gate.DESCRIPTION, "J2", _late_encoder),
     (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-tilted"))),
     (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-turned"))),
     (Gate.DESCRIPTION, "J3", _diagnosed(diagnosis_named("position-late", "J3"))),
@@ -476,6 +491,7 @@ def test_the_table_lists_every_gate_once_with_its_description() -> None:
             nameplate_holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
         ),
         _calibration(effects=()),
+        _unexplained(1e-4),
         _corrected("zero-offset", diagnosis_named("zero-off", "J3")),
         _corrected("gravity-direction", diagnosis_named("gravity-tilted")),
         _corrected("late-position", diagnosis_named("position-late", "J3")),

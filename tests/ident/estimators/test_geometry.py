@@ -1,4 +1,4 @@
-"""Zeros and lengths from redundant encoders: one wrong number is named, and a right description says nothing."""
+"""Geometry from redundant encoders: one wrong number is named, and nothing else is corrected for it."""
 
 from __future__ import annotations
 
@@ -7,66 +7,94 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy
 from numpy.typing import NDArray
 
 from ident.data.run import Run
 from ident.errors import ModelError
-from ident.estimators.geometry_estimate import GeometryFinding, Positions, estimate_geometry, thinned
-from ident.model.geometry import GeometryChange, geometry_parameters
+from ident.estimators.geometry_estimate import GeometryFinding, estimate_geometry, thinned
+from ident.model.geometry import (
+    GeometryChange,
+    GeometryKind,
+    GeometryParameter,
+    base_places,
+    encoder_delays,
+    geometry_parameters,
+)
 from ident.model.geometry_derivatives import model_with_geometry
-from tests.ident.closed_recordings import axis_positions
+from tests.ident.closed_recordings import RATE_HZ, axis_positions
 from tests.ident.mechanisms import FIVE_BAR, PLANAR
 
 FloatArray = NDArray[np.float64]
 NOISE_RAD = 5e-6  #: of a count of 2⁻¹⁶ turns of a motor behind a gear of 5, as of the shipped redundant robot
 PARAMETERS = geometry_parameters(PLANAR.robot)
-SAMPLES = 120
+X_OF_FIRST = GeometryParameter(GeometryKind.PLACE, "motor-0", "x")
+Y_OF_SECOND = GeometryParameter(GeometryKind.PLACE, "motor-1", "y")
+SECONDS = 12.0
+DRAWN = 2000  #: Samples of a shorter run, where many are drawn
+COUNT_RAD = 2.0 * np.pi / (65536 * 5)
 
 
 @cache
 def _exact(seed: int) -> FloatArray:
-    """Positions of the motors that the closures allow, 0.1 s apart."""
-    rng = np.random.default_rng(seed)
-    return axis_positions(PLANAR, rng, 20.0)[::25][:SAMPLES]
+    """Positions of the motors that the closures allow."""
+    return axis_positions(PLANAR, np.random.default_rng(seed), SECONDS)
 
 
-def _recorded(seed: int, noise_rad: float = NOISE_RAD, bend_rad: FloatArray | float = 0.0) -> tuple[Positions, ...]:
-    exact = _exact(seed)
-    noise = noise_rad * np.random.default_rng(100 + seed).standard_normal(exact.shape)
-    return (Positions("run", exact + noise + bend_rad, np.arange(len(exact)) // 20),)
+def _run(position_rad: FloatArray) -> Run:
+    time_s = np.arange(len(position_rad)) / RATE_HZ
+    return Run("run", time_s, position_rad, np.zeros_like(position_rad))
 
 
-def _described(*wrong: tuple[int, float], seed: int = 1, noise_rad: float = NOISE_RAD) -> GeometryFinding:
+def _noise(seed: int, shape: tuple[int, ...], correlation_s: float = 0.0) -> FloatArray:
+    """Draw noise of σ = 1: white, or that decays over a time."""
+    white = np.random.default_rng(100 + seed).standard_normal(shape)
+    if correlation_s == 0.0:
+        return white
+    kept = np.exp(-1.0 / (RATE_HZ * correlation_s))
+    white[1:] *= np.sqrt(1.0 - kept**2)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -kept], white, axis=0))
+
+
+def _found(
+    *wrong: tuple[GeometryParameter, float], position_rad: FloatArray | None = None, seed: int = 1
+) -> GeometryFinding:
     """Finding with a description in which numbers are off; what has to be added is the negative of it."""
-    changes = [GeometryChange(PARAMETERS[number], change) for number, change in wrong]
-    found = estimate_geometry(model_with_geometry(PLANAR.model, changes), _recorded(seed, noise_rad))
+    changes = [GeometryChange(parameter, change) for parameter, change in wrong]
+    if position_rad is None:
+        exact = _exact(seed)
+        position_rad = exact + NOISE_RAD * _noise(seed, exact.shape)
+    found = estimate_geometry(model_with_geometry(PLANAR.model, changes), (thinned(_run(position_rad)),))
     assert found is not None
     return found
 
 
+def _is_named(found: GeometryFinding, parameter: GeometryParameter, change: float) -> bool:
+    """Whether one number alone explains a misfit down to the noise, with its value within 3 σ."""
+    assert found.is_significant
+    assert found.misfit_left == pytest.approx(found.noise, rel=0.15)
+    (cause,) = found.causes
+    return cause.parameter == parameter and abs(cause.change - change) < 3.0 * cause.std
+
+
 @pytest.mark.parametrize("degrees", [0.05, -0.1, 0.5])
 def test_a_wrong_zero_is_named(degrees: float) -> None:
-    found = _described((1, np.radians(degrees)))
-    (correction,) = found.corrections
-    assert found.is_significant
-    assert correction.parameter == PARAMETERS[1]
-    assert abs(correction.change + np.radians(degrees)) < 4.0 * correction.std
-    assert correction.std < np.radians(1e-3)
+    found = _found((PARAMETERS[1], np.radians(degrees)))
+    assert _is_named(found, PARAMETERS[1], -np.radians(degrees))
+    assert found.corrections == found.causes
+    assert found.corrections[0].std < np.radians(1e-3)
     assert found.alternatives == ()
-    assert found.misfit > 50.0 * found.misfit_left
-    assert found.misfit_left == pytest.approx(NOISE_RAD, rel=0.2)
+    assert found.noise == pytest.approx(NOISE_RAD, rel=0.2)
 
 
 @pytest.mark.parametrize(("number", "share"), [(4, 0.001), (5, -0.003), (9, 0.01), (10, 0.003)])
 def test_a_wrong_length_is_named(number: int, share: float) -> None:
-    found = _described((number, 0.28 * share))
-    (correction,) = found.corrections
-    assert correction.parameter == PARAMETERS[number]
-    assert abs(correction.change + 0.28 * share) < 4.0 * correction.std
+    found = _found((PARAMETERS[number], 0.28 * share))
+    assert _is_named(found, PARAMETERS[number], -0.28 * share)
 
 
 def test_two_wrong_numbers_are_named_together() -> None:
-    found = _described((0, 2e-3), (10, -4e-4))
+    found = _found((PARAMETERS[0], 2e-3), (PARAMETERS[10], -4e-4))
     assert {one.parameter for one in found.corrections} == {PARAMETERS[0], PARAMETERS[10]}
     assert found.changes[0].change == found.corrections[0].change
     assert found.covariance.shape == (2, 2)
@@ -75,61 +103,127 @@ def test_two_wrong_numbers_are_named_together() -> None:
         assert abs(one.change + wrong) < 4.0 * one.std
 
 
-def test_many_wrong_numbers_are_estimated_together() -> None:
+@pytest.mark.parametrize("parameter", [X_OF_FIRST, Y_OF_SECOND])
+def test_a_motor_that_sits_elsewhere_on_the_base_is_no_zero_and_no_rod(parameter: GeometryParameter) -> None:
+    found = _found((parameter, 3e-4))
+    assert _is_named(found, parameter, -3e-4)
+    assert found.corrections == found.causes
+
+
+@pytest.mark.parametrize("delay_s", [0.001, 0.003, 0.010])
+def test_a_late_encoder_is_named_and_nothing_is_corrected_for_it(delay_s: float) -> None:
+    position_rad = _exact(1).copy()
+    time_s = np.arange(len(position_rad)) / RATE_HZ
+    on_time = scipy.interpolate.CubicSpline(time_s, position_rad[:, 1])
+    position_rad[:, 1] = on_time(time_s - delay_s)
+    found = _found(position_rad=position_rad + NOISE_RAD * _noise(1, position_rad.shape))
+    assert _is_named(found, encoder_delays(PLANAR.robot)[1], delay_s)
+    assert found.corrections == ()
+    assert found.changes == ()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("axes", [(1.0, 0.0, -1.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.7, -0.4, 1.0, 0.2)])
+def test_arms_that_bend_are_no_wrong_numbers(seed: int, axes: tuple[float, ...]) -> None:
+    """A misfit that turns with the pose is explained by some numbers to a part, but not down to the noise."""
+    exact = _exact(seed)
+    bend_rad = 2e-4 * np.sin(3.0 * exact[:, [0]]) * np.array(axes)
+    found = _found(position_rad=exact + bend_rad + NOISE_RAD * _noise(seed, exact.shape), seed=seed)
+    assert found.is_significant
+    assert found.causes == ()
+    assert found.corrections == ()
+    assert found.misfit > 5.0 * found.noise
+    assert found.misfit_left < found.misfit
+
+
+def test_more_wrong_numbers_than_three_are_not_corrected() -> None:
     rng = np.random.default_rng(5)
-    wrong = [(number, 1e-3 * float(rng.standard_normal())) for number in range(len(PARAMETERS))]
-    found = _described(*wrong)
-    assert len(found.corrections) == len(PARAMETERS)
-    scaled = [(one.change + change) / one.std for one, (_, change) in zip(found.corrections, wrong, strict=True)]
-    assert np.sqrt(np.mean(np.square(scaled))) < 2.0
+    wrong = [(parameter, 1e-3 * float(rng.standard_normal())) for parameter in PARAMETERS]
+    found = _found(*wrong)
+    assert found.is_significant
+    assert found.corrections == ()
+    assert found.misfit_left == pytest.approx(NOISE_RAD, rel=0.2)
 
 
 def test_a_right_description_says_nothing() -> None:
-    for seed in range(1, 11):
-        found = _described(seed=seed)
+    for seed in range(1, 6):
+        found = _found(seed=seed)
         assert not found.is_significant
-        assert found.corrections == ()
+        assert found.causes == ()
         assert found.misfit == found.misfit_left
 
 
-def test_deviations_are_those_of_the_noise() -> None:
-    """All numbers together: what weakly seen directions scatter is in σ."""
-    scaled = []
-    for seed in range(1, 5):
-        scaled += [one.change / one.std for one in _described(seed=seed).every]
-    assert 0.7 < np.sqrt(np.mean(np.square(scaled))) < 1.4
+@pytest.mark.parametrize("correlation_s", [0.02, 0.1, 0.5])
+def test_deviations_are_those_of_the_noise(correlation_s: float) -> None:
+    """All numbers together: what weakly seen directions scatter is in σ, and so is what slow noise does."""
+    scaled: list[float] = []
+    for draw in range(30):
+        exact = _exact(1 + draw % 3)[:DRAWN]
+        noise = NOISE_RAD * _noise(draw, exact.shape, correlation_s)
+        found = _found(position_rad=exact + noise)
+        assert not found.is_significant
+        scaled += [one.change / one.std for one in found.every if np.isfinite(one.std)]
+    assert len(scaled) > 200
+    assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.2
+
+
+@pytest.mark.parametrize("correlation_s", [0.02, 0.1, 0.5])
+def test_slow_noise_hides_no_wrong_zero(correlation_s: float) -> None:
+    exact = _exact(1)
+    noisy = exact + NOISE_RAD * _noise(1, exact.shape, correlation_s)
+    found = _found((PARAMETERS[1], 1e-3), position_rad=noisy)
+    (correction,) = found.corrections
+    assert correction.parameter == PARAMETERS[1]
+    assert abs(correction.change + 1e-3) < 3.0 * correction.std
+    assert found.noise < 0.5 * NOISE_RAD  # what neighbouring samples show of it
+
+
+@pytest.mark.parametrize("share", [1.0, 0.002])
+def test_rounding_to_counts_is_noise(share: float) -> None:
+    """Also of axes so slow that neighbouring samples have the same count."""
+    exact = axis_positions(PLANAR, np.random.default_rng(1), SECONDS, share)
+    found = _found(position_rad=COUNT_RAD * np.round(exact / COUNT_RAD))
+    assert not found.is_significant
+    assert found.noise == pytest.approx(COUNT_RAD / np.sqrt(12.0), rel=0.15)
 
 
 def test_a_count_below_what_bends_a_gain_says_nothing() -> None:
-    assert not _described((1, 1e-5), noise_rad=1e-8).is_significant
-
-
-def test_arms_that_bend_are_no_wrong_zero() -> None:
-    """A misfit that turns with the pose is larger than noise, and is not blamed on one number."""
-    bend = 2e-4 * np.sin(3.0 * _exact(2)[:, [0]]) * np.array([1.0, 0.0, -1.0, 0.5])
-    found = estimate_geometry(PLANAR.model, _recorded(2, bend_rad=bend))
-    assert found is not None
-    assert len(found.corrections) != 1
+    exact = _exact(1)
+    found = _found((PARAMETERS[1], 1e-5), position_rad=exact + 1e-8 * _noise(1, exact.shape))
+    assert not found.is_significant
 
 
 def test_encoders_that_no_pose_fits_are_refused() -> None:
     with pytest.raises(ModelError, match="motors do not fit each other"):
-        _described((1, 0.2))
+        _found((PARAMETERS[1], 0.2))
 
 
 def test_without_redundant_encoders_or_positions_nothing_is_said() -> None:
-    positions = Positions("run", np.zeros((100, 2)), np.arange(100) // 20)
-    assert estimate_geometry(FIVE_BAR.model, (positions,)) is None
-    few = replace(_recorded(1)[0], position_rad=_exact(1)[:20], stretch=np.arange(20))
-    assert estimate_geometry(PLANAR.model, (few,)) is None
+    assert estimate_geometry(FIVE_BAR.model, (thinned(_run(np.zeros((1000, 2)))),)) is None
+    assert estimate_geometry(PLANAR.model, (thinned(_run(_exact(1)[:200])),)) is None
+    assert estimate_geometry(PLANAR.model, (thinned(_run(_exact(1)[:4])),)) is None
 
 
 def test_positions_are_thinned_where_every_axis_is_valid() -> None:
     q = np.arange(1000.0)[:, None] * np.ones(4)
     valid = np.ones(q.shape, dtype=np.bool_)
-    valid[10, 2] = False
+    valid[40, 2] = False
     run = Run("run", np.arange(1000) / 500.0, q, np.zeros_like(q), valid=valid)
     found = thinned(run)
-    assert list(found.position_rad[:3, 0]) == [0.0, 20.0, 30.0]
-    assert len(thinned(replace(run, valid=None)).position_rad) == 100
-    assert found.stretch.max() == 0
+    # Ten samples on either side belong to a position.
+    assert list(found.position_rad[:4, 0]) == [10.0, 20.0, 60.0, 70.0]
+    assert list(found.before_rad[:2, 0]) == [9.0, 19.0]
+    assert list(found.after_rad[:2, 0]) == [11.0, 21.0]
+    assert np.allclose(found.motion[:, :, 0], 500.0)
+    assert np.allclose(found.motion[:, :, 1:] * 0.02 ** np.arange(2, 5), 0.0, atol=1e-6)
+    assert np.allclose(found.count_rad, 1.0)
+    assert len(thinned(replace(run, valid=None)).position_rad) == 98
+
+
+def test_a_place_on_the_base_is_one_of_its_coordinates() -> None:
+    assert X_OF_FIRST in base_places(PLANAR.robot)
+    moved = model_with_geometry(PLANAR.model, [GeometryChange(Y_OF_SECOND, 0.002)]).robot
+    before = {joint.name: joint.translation_m for joint in PLANAR.robot.joints}
+    for joint in moved.joints:
+        shift = [0.0, 0.002, 0.0] if joint.name == "motor-1" else [0.0, 0.0, 0.0]
+        assert np.allclose(joint.translation_m - before[joint.name], shift, atol=1e-15)
