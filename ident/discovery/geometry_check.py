@@ -19,7 +19,7 @@ from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
 from ident.discovery.joining import UNFITTED, refuted_by_instruments
-from ident.discovery.late_currents import find_late_currents, torque_rates, try_delays, with_delays
+from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
@@ -131,12 +131,15 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     """
     gates = gates or Gates()
     problem = _problem_at_rows(evidence)
-    rates_nm_s = torque_rates(evidence)
-    of_currents = try_delays(problem, rates_nm_s)
-    tested = (*_tested(problem, GEOMETRY), *of_currents)
-    findings = rank_families(problem, tested, rng, gates)
+    of_geometry = _tested(problem, GEOMETRY)
+    screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
+    findings = rank_families(problem, screened, rng, gates)
     mistakes: tuple[Finding, ...] = ()
     if any(found.passed for found in findings):
+        rates_nm_s = torque_rates(evidence)
+        of_currents = try_delays(problem, rates_nm_s)
+        tested = (*of_geometry, *of_currents)
+        findings = rank_families(problem, tested, rng, gates)
         suspects = _suspects(problem, findings, of_currents, rates_nm_s)
         rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
         mistakes = _mistakes(evidence, problem, suspects, rivals)

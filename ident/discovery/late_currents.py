@@ -40,6 +40,20 @@ class LateCurrents:
     held_out: FloatArray  #: ‖e‖² of each fold with them, shape (folds,)
 
 
+def rough_torque_rates(evidence: Evidence) -> FloatArray:
+    """Rate of each motor's predicted torque by differences of the rows of a fit [Nm/s], shape (m, r).
+
+    It takes no time, and misses a third of what `torque_rates` has: enough to see whether a current may be late.
+    """
+    rows = evidence.training
+    torque_nm = evidence.model.drive_train.to_motor @ evidence.estimate.predicted_torque(rows)
+    rates = np.zeros_like(torque_nm)
+    for run in np.unique(rows.run):
+        own = rows.run == run
+        rates[:, own] = np.gradient(torque_nm[:, own], rows.time_s[own], axis=1)
+    return rates
+
+
 def torque_rates(evidence: Evidence) -> FloatArray:
     """Rate of each motor's predicted torque on the rows of a fit [Nm/s], shape (m, r).
 
