@@ -56,6 +56,7 @@ class Gravity:
     found_m_s2: FloatArray  #: of the same length, shape (3,)
     turn_rad: float  #: angle between both
     turn_std_rad: float  #: its σ
+    covariance_rad2: FloatArray  #: of the turn about both axes of `ident.effects.geometry_corrections.across`, (2, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +64,15 @@ class GeometryCheck:
     """What a fit says of the description of its robot, and of the clock of its recordings."""
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
-    #: The mistake that the data show: one correction, a time skew, or a lag of each current that is late.
-    mistakes: tuple[Finding, ...]
+    #: The correction of the description or of the clock that the data ask for; None where they ask for none.
+    mistake: Finding | None
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
+    also_late: tuple[Finding, ...] = ()  #: the other late currents, where the mistake is one of several
 
     @property
-    def mistake(self) -> Finding | None:
-        """The mistake, the first one of several late currents; None where the data show none."""
-        return self.mistakes[0] if self.mistakes else None
+    def mistakes(self) -> tuple[Finding, ...]:
+        """The mistake, with the other currents that are late where it is one."""
+        return () if self.mistake is None else (self.mistake, *self.also_late)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +147,9 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         mistakes = _mistakes(evidence, problem, suspects, rivals)
     return GeometryCheck(
         gravity=_gravity(evidence, problem),
-        mistakes=mistakes,
+        mistake=mistakes[0] if mistakes else None,
         hidden_zeros=_hidden_zeros(findings, evidence.model.robot),
+        also_late=mistakes[1:],
     )
 
 
@@ -321,12 +324,13 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
     angle = float(np.linalg.norm(turn))
     # σ along the turn that was found; of no turn at all, any.
     along = turn / angle if angle > 0.0 else np.array([1.0, 0.0])
-    variance = float(along @ _covariance_of(estimate, placed) @ along)
+    covariance_rad2 = _covariance_of(estimate, placed)
     return Gravity(
         declared_m_s2=declared_m_s2,
         found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),
         turn_rad=angle,
-        turn_std_rad=float(np.sqrt(variance)),
+        turn_std_rad=float(np.sqrt(along @ covariance_rad2 @ along)),
+        covariance_rad2=covariance_rad2,
     )
 
 
