@@ -389,16 +389,14 @@ def _correction_diagnosis(
                 "the other axes"
             )
         case Lag():
-            found = f"the current of {name} {_late_text(values, deviations)}, on this axis alone"
+            found = f"the current of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
             remedy = (
                 "look for what delays this current alone: a filter of its drive, a slower channel, another time stamp "
                 f"than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
             )
         case TimeSkew():
-            found = (
-                f"all currents {_late_text(values, deviations)} beside the positions, by the same time on every axis"
-            )
+            found = f"all currents {_late_text(values, deviations)} beside the positions, the same on every axis"
             expected = ONE_MOMENT
             remedy = (
                 "no single encoder or drive is late: check how positions and currents are stamped (two messages of one "

@@ -18,7 +18,7 @@ from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
-from ident.discovery.joining import UNFITTED, refuted_by_instruments
+from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
@@ -45,6 +45,7 @@ AT_ROWS = frozenset(
 CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one moment
 SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
 SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
+LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
 OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
 
 
@@ -126,12 +127,13 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     Args:
         evidence: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
-        gates: limits for a mistake, those of a search.
+        gates: limits for a mistake, those of a search; its share of one motor's residual is not among them.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    gates = gates or Gates()
+    # What the arm does wrong is spread over all motors, and a delay is judged by its length.
+    gates = replace(gates or Gates(), explained=0.0, error_fall=0.0)
     problem = _problem_at_rows(evidence)
     of_geometry = _tested(problem, GEOMETRY)
     screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
@@ -293,7 +295,9 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> t
         values, deviations = coefficients_of(estimate, placed)
         if impossible(placed.effect.coefficients, values, deviations):
             continue
-        if in_noise(values, _covariance_of(estimate, placed)):
+        if suspect.is_of_currents and abs(float(values[0])) < LEAST_DELAY_S:
+            continue
+        if in_noise(values, _covariance_of(estimate, placed), SHOWN):
             continue
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue

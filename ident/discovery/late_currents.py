@@ -24,7 +24,7 @@ from ident.equations.rows import decimate_rows
 Delay = Lag | TimeSkew
 
 CERTAIN_SIGMAS = 4.0  #: By which the delay of a motor must differ from zero to be named
-ALIKE_SIGMAS = 3.0  #: Within which a delay is the common one
+ALIKE_SIGMAS = 2.5  #: Within which a delay is the common one
 ALIKE_SHARE = 1.0 / 3.0  #: Of the common delay, within which a delay is the common one, too: filters differ a little
 REFITS = 4  #: Refits with the filter of the delays found; see `ident.discovery.time_skew`
 SETTLED = 0.1  #: Share of σ below which another refit is not worth its time
