@@ -174,9 +174,10 @@ class EffectImpossible(EffectRefused):
 class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
-    #: One of axis-error, axis-idle, channels-exchanged, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned, length-off, payload-differs,
-    #: place-off, position-late, position-reversed, torque-above-limit, zero-off, zero-turned.
+    #: One of axis-error, axis-idle, channels-exchanged, current-late, current-off-scale, current-reversed,
+    #: estimators-disagree, gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned,
+    #: length-off, payload-differs, place-off, position-late, position-reversed, time-skew, torque-above-limit,
+    #: zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

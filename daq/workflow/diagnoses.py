@@ -22,6 +22,8 @@ The order of the judgements, causes before their traces:
    undecided or that it has set aside (`open_correction_diagnoses`), and what the check says beside its model. They are
    named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
+
+Currents that are late, one of them or all alike, are named with 7., but they hide no exchange of currents.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.loop import Step
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
 from ident.equations.system import System
@@ -292,27 +295,26 @@ def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Dia
         cell: whose description it is.
         model: as declared.
     """
-    found = check.mistake
-    if found is None:
-        return ()
-    placed = PlacedEffect(found.effect, found.axis)
-    return (_correction_diagnosis(placed, found.coefficients, found.deviations, cell, model),)
+    diagnoses: list[Diagnosis] = []
+    for found in check.mistakes:
+        placed = PlacedEffect(found.effect, found.axis)
+        diagnoses.append(_correction_diagnosis(placed, found.coefficients, found.deviations, cell, model))
+    return tuple(diagnoses)
 
 
 def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...]:
-    """Diagnoses of the corrections that a search has made.
+    """Diagnoses of the corrections that a search has made, and of the late currents that it has found.
 
     Args:
         evidence: with its effects.
         cell: whose description it is.
     """
-    if evidence.uncorrected is None:
-        return ()
+    given = evidence.uncorrected or evidence
     found: list[Diagnosis] = []
-    for placed in evidence.effects:
-        if is_correction(placed):
+    for placed in evidence.effects[evidence.declared :]:
+        if type(placed.effect) in CORRECTED_BY:
             values, deviations = coefficients_of(evidence.estimate, placed)
-            found.append(_correction_diagnosis(placed, values, deviations, cell, evidence.uncorrected.model))
+            found.append(_correction_diagnosis(placed, values, deviations, cell, given.model))
     return tuple(found)
 
 
@@ -403,8 +405,14 @@ CORRECTED_BY: dict[type[Effect], str] = {
     ZeroOffset: "zero-off",
     LatePosition: "position-late",
     GravityDirection: "gravity-tilted",
+    Lag: "current-late",
+    TimeSkew: "time-skew",
 }
-"""Diagnosis of a wrong description, by the effect that corrects it."""
+"""Diagnosis of a wrong description, or of currents that are late, by the effect that corrects it."""
+OF_DESCRIPTION = frozenset({"zero-off", "position-late", "gravity-tilted"})
+"""Those of a wrong description, which may look like exchanged currents."""
+SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
+INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"
 
 
 def _diagnosis_of(
@@ -428,13 +436,26 @@ def _correction_diagnosis(
             expected = "positions whose zero is that of the URDF"
             remedy = zero_remedy(name, scale * values[0], scale * deviations[0], unit, described) + "; then fit again"
         case LatePosition():
-            delay = f"{1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
-            late = "late" if values[0] > 0.0 else "early"
-            found = f"the position of {name} {late} by {delay}"
+            found = f"the position of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
             remedy = (
                 "look for what delays this encoder alone: a filter, a slower channel, another time stamp than that of "
                 "the other axes"
+            )
+        case Lag():
+            found = f"the current of {name} {_late_text(values, deviations)}"
+            expected = ONE_MOMENT
+            remedy = (
+                "look for what delays this current alone: a filter of its drive, a slower channel, another time stamp "
+                f"than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
+            )
+        case TimeSkew():
+            found = f"all currents {_late_text(values, deviations)} beside the positions, the same on every axis"
+            expected = ONE_MOMENT
+            remedy = (
+                "no single encoder or drive is late: check how positions and currents are stamped (two messages of one "
+                "cycle, two clocks, a filter that every drive has) and record again; "
+                f"{SMALL_DELAY} of the recording; {INTO_THE_MODEL}"
             )
         case _:
             declared = model.robot.gravity_m_s2
@@ -460,6 +481,12 @@ def _zero_text(axis: int, name: str, values: FloatArray, deviations: FloatArray,
     return zero_off_text(name, scale * values[0], scale * deviations[0], unit)
 
 
+def _late_text(values: FloatArray, deviations: FloatArray) -> str:
+    """By how much something is late or early, with σ."""
+    late = "late" if values[0] > 0.0 else "early"
+    return f"{late} by {1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
+
+
 def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
     """Angle of a turn of gravity with σ."""
     angle = float(np.linalg.norm(values))
@@ -468,8 +495,9 @@ def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
 
 
 def vector_text(vector: FloatArray) -> str:
-    """A vector as a cell file has it: `[0.00, 0.34, -9.80]`."""
-    return f"[{', '.join(f'{entry:.2f}' for entry in vector)}]"
+    """A vector as a cell file has it, `[0.000, 0.340, -9.804]`: of gravity, a digit of the last place is 0.006°."""
+    rounded = np.round(vector, 3) + 0.0  # no minus before a zero
+    return f"[{', '.join(f'{entry:.3f}' for entry in rounded)}]"
 
 
 def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
@@ -479,6 +507,7 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
     names = [axes[axis] for axis in check.hidden_zeros]
     subject = "the zeros of" if len(names) > 1 else "the zero of"
     return (
-        f"These data do not show {subject} {' and '.join(names)}: about a vertical axis, or behind the last joint, "
-        "another zero makes nearly the same torques."
+        f"These data do not show {subject} {' and '.join(names)}: with another zero, and link parameters to match, the "
+        "torques are nearly the same. So it is with a joint about the vertical, with the last joint, and with most "
+        "slides."
     )

@@ -1,8 +1,8 @@
 """Add the effects that a cell declares: they are fitted, not searched for.
 
 A declared effect must be possible: a balancer does not push where it must pull. Where its coefficients are not, the
-declaration is refused, unless a wrong zero, gravity or a late position is the cause: the torque of a balancer and that
-of gravity are alike, so that a base that leans by a degree makes a true balancer look impossible.
+declaration is refused, unless the geometry or the clock is the cause (`ident.discovery.geometry_check`): the torque of
+a balancer and that of gravity are alike, so that a base that leans by a degree makes a true balancer look impossible.
 """
 
 from __future__ import annotations
@@ -90,16 +90,16 @@ def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
 
 
 def _is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]) -> bool:
-    """Whether the data ask for another geometry, and all declared effects are possible with it."""
+    """Whether the data ask for another geometry or clock, and all declared effects are possible with it."""
     try:
-        mistake = check_geometry(evidence, rng).mistake
+        mistakes = check_geometry(evidence, rng).mistakes
     except TooFewMoves:
         return False
-    if mistake is None:
+    if not mistakes:
         return False
-    correction = PlacedEffect(mistake.effect, mistake.axis)
+    corrections = tuple(PlacedEffect(found.effect, found.axis) for found in mistakes)
     try:
-        corrected = with_effects(evidence, (*evidence.effects, correction))
+        corrected = with_effects(evidence, (*evidence.effects, *corrections))
     except UNFITTED:
         return False
     return not impossible_declared(replace(corrected, declared=evidence.declared), axes)

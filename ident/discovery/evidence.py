@@ -159,7 +159,7 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
         training=training,
         holdout=holdout,
         effects=(),
-        estimate=estimate_with(before.estimate.method, training.system(), _fixed_gains(before)),
+        estimate=estimate_with(before.estimate.method, training.system(), fixed_gains(before)),
         corrections=corrections,
         uncorrected=given if corrections else None,
     )
@@ -201,7 +201,7 @@ def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
     return tuple(effects) if is_moved else None
 
 
-def _fixed_gains(evidence: Evidence) -> FloatArray | None:
+def fixed_gains(evidence: Evidence) -> FloatArray | None:
     """Gains that the fit holds; None where it finds them."""
     return evidence.estimate.gains if evidence.estimate.gains_fixed else None
 
@@ -209,7 +209,7 @@ def _fixed_gains(evidence: Evidence) -> FloatArray | None:
 def _refitted(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]) -> Evidence:
     """Refit with effects; the description has their corrections already."""
     around, current, began_s = before, before, session_began_s(before.fit_runs)  # held-out runs must not affect the fit
-    fixed = _fixed_gains(before)
+    fixed = fixed_gains(before)
     joints = before.model.robot.places
     columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
     bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)

@@ -1,9 +1,10 @@
-"""Whether the description of a robot is wrong, beside a fit: without a search, and without correcting anything.
+"""Whether the description of a robot, or the clock of its recordings, is wrong: without a search, correcting nothing.
 
-Zeros of joints, the direction of gravity and late positions are tested on the rows of a fit
-(`ident.effects.geometry_corrections`). Where one of them passes, it must also explain more of what is left out than
-each named effect of one axis does, or most of it beside the best of these: a spring that the model lacks explains a
-part of what a wrong zero does, and friction that it lacks on another axis does not.
+Zeros of joints, the direction of gravity, late positions and late currents are tested on the rows of a fit
+(`ident.effects.geometry_corrections`, `ident.discovery.late_currents`). Where one of them passes, it must also explain
+more of what is left out than each named effect of one axis does, or most of it beside the best of these: a spring that
+the model lacks explains a part of what a wrong zero does, and friction that it lacks on another axis does not. What is
+left is fitted together with everything else, and must pass by the σ of that fit, which is the one that is reported.
 """
 
 from __future__ import annotations
@@ -15,21 +16,36 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
-from ident.discovery.evidence import Evidence, coefficients_of, with_effects
-from ident.discovery.gates import Gates
+from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
+from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
+from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
+from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import Effect, PlacedEffect, is_placeable
-from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, turned_gravity
+from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
+from ident.effects.electrical import Lag, TimeSkew
+from ident.effects.geometry_corrections import (
+    GeometryEffect,
+    GravityDirection,
+    LatePosition,
+    ZeroOffset,
+    turned_gravity,
+)
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
-from ident.errors import IdentificationError
+from ident.estimators.estimate import Estimate
+from ident.estimators.identify import estimate_with
+from ident.estimators.method import Method
+from ident.model.robot import JointKind, Robot
 
 AT_ROWS = frozenset(
     {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
 )
 """Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
-SEEN_ZERO = 0.02  #: Largest σ of a zero that the data show, 1.1° or 20 mm; usual are some hundredths of a degree
+CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one moment
+SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
+SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
+LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
 OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
 
 
@@ -41,91 +57,296 @@ class Gravity:
     found_m_s2: FloatArray  #: of the same length, shape (3,)
     turn_rad: float  #: angle between both
     turn_std_rad: float  #: its σ
+    covariance_rad2: FloatArray  #: of the turn about both axes of `ident.effects.geometry_corrections.across`, (2, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryCheck:
-    """What a fit says of the description of its robot."""
+    """What a fit says of the description of its robot, and of the clock of its recordings."""
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
-    mistake: Finding | None  #: the correction that the data ask for; None where they ask for none
+    #: The correction of the description or of the clock that the data ask for; None where they ask for none.
+    mistake: Finding | None
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
+    also_late: tuple[Finding, ...] = ()  #: the other late currents, where the mistake is one of several
+
+    @property
+    def mistakes(self) -> tuple[Finding, ...]:
+        """The mistake, with the other currents that are late where it is one."""
+        return () if self.mistake is None else (self.mistake, *self.also_late)
+
+
+@dataclass(frozen=True, slots=True)
+class _Suspect:
+    """A mistake that may explain the residual, to first order."""
+
+    effects: tuple[PlacedEffect, ...]
+    torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
+    values: FloatArray  #: their coefficients, shape (p,)
+    held_out_fall: float  #: fall of the whitened ‖e‖² on held-out moves
+
+    @property
+    def is_of_currents(self) -> bool:
+        """Whether currents are late."""
+        return isinstance(self.effects[0].effect, (Lag, TimeSkew))
+
+
+@dataclass(frozen=True, slots=True)
+class _Rivals:
+    """What suspects compete with."""
+
+    findings: tuple[Finding, ...]  #: the best on held-out moves first
+    at_full_rate: dict[PlacedEffect, FloatArray]  #: columns of those that are not built at the rows
+
+    def findings_of(self, effects: Sequence[PlacedEffect]) -> tuple[Finding, ...]:
+        """Findings of some effects, in their order."""
+        by_place = {(found.effect.name, found.axis): found for found in self.findings}
+        return tuple(by_place[placed.effect.name, placed.axis] for placed in effects)
+
+    def others(self, suspect: _Suspect) -> list[Finding]:
+        """Findings of all others, and for late currents of no delay of currents."""
+        own = {(placed.effect.name, placed.axis) for placed in suspect.effects}
+        others: list[Finding] = []
+        for found in self.findings:
+            is_of_currents = suspect.is_of_currents and isinstance(found.effect, (Lag, TimeSkew))
+            if (found.effect.name, found.axis) not in own and not is_of_currents:
+                others.append(found)
+        return others
+
+    def torque_nm(self, problem: SearchProblem, found: Finding) -> FloatArray:
+        """Columns of a finding at the joints, shape (m, p, r)."""
+        placed = PlacedEffect(found.effect, found.axis)
+        if placed in self.at_full_rate:
+            return self.at_full_rate[placed]
+        return problem.torque_at_rows(found.effect, found.axis)
 
 
 def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
-    """Test the geometry beside a fit.
+    """Test geometry and clock beside a fit.
 
     Args:
         evidence: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
-        gates: limits for a correction, those of a search.
+        gates: limits for a mistake, those of a search; its share of one motor's residual is not among them.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    gates = gates or Gates()
+    # What the arm does wrong is spread over all motors, and a delay is judged by its length.
+    gates = replace(gates or Gates(), explained=0.0, error_fall=0.0)
     problem = _problem_at_rows(evidence)
-    tested = _tested(problem, GEOMETRY)
-    findings = rank_families(problem, tested, rng, gates)
-    passed = [found for found in findings if found.passed]
-    mistake = passed[0] if passed else None
-    if mistake is not None:
-        rivals = rank_families(problem, (*tested, *_tested(problem, _slow(EFFECTS))), rng, gates)
-        best = max(rivals, key=lambda found: found.held_out_fall)
-        is_best = (best.effect, best.axis) == (mistake.effect, mistake.axis)
-        if not is_best and not _explains_beside(problem, mistake, best):
-            mistake = None
-    if mistake is not None:
-        mistake = _settled(evidence, mistake)
-    zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
-    shown = {found.axis for found in zeros if found.deviations[0] < SEEN_ZERO}
-    robot = evidence.model.robot
-    can_be_wrong = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
+    of_geometry = _tested(problem, GEOMETRY)
+    screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
+    findings = rank_families(problem, screened, rng, gates)
+    mistakes: tuple[Finding, ...] = ()
+    if any(found.passed for found in findings):
+        rates_nm_s = torque_rates(evidence)
+        of_currents = try_delays(problem, rates_nm_s)
+        tested = (*of_geometry, *of_currents)
+        findings = rank_families(problem, tested, rng, gates)
+        suspects = _suspects(problem, findings, of_currents, rates_nm_s)
+        rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
+        mistakes = _mistakes(evidence, problem, suspects, rivals)
     return GeometryCheck(
-        gravity=_gravity(findings, robot.gravity_m_s2),
-        mistake=mistake,
-        hidden_zeros=tuple(axis for axis in can_be_wrong if axis not in shown),
+        gravity=_gravity(evidence, problem),
+        mistake=mistakes[0] if mistakes else None,
+        hidden_zeros=_hidden_zeros(findings, evidence.model.robot),
+        also_late=mistakes[1:],
     )
 
 
-def _settled(evidence: Evidence, mistake: Finding) -> Finding:
-    """A correction with the value that it has once it is applied to the description: its column is for small ones."""
-    placed = PlacedEffect(mistake.effect, mistake.axis)
-    try:
-        corrected = with_effects(evidence, (*evidence.effects, placed))
-    except IdentificationError:
-        return mistake
-    applied = corrected.effects[-1]
-    values, deviations = coefficients_of(corrected.estimate, applied)
-    return replace(mistake, coefficients=values, deviations=deviations)
+def _suspects(
+    problem: SearchProblem,
+    findings: Sequence[Finding],
+    of_currents: Sequence[FamilyTrials],
+    rates_nm_s: FloatArray,
+) -> tuple[_Suspect, ...]:
+    """The mistakes that pass, the best on held-out moves first.
+
+    Late currents are one suspect, whichever of them pass. They are one as well where a late position does alone: the
+    delays of several currents, of which none passes alone, look like it.
+    """
+    suspects: list[_Suspect] = []
+    passed = [found for found in findings if found.passed]
+    for found in passed:
+        if not isinstance(found.effect, (Lag, TimeSkew)):
+            placed = PlacedEffect(found.effect, found.axis)
+            torque_nm = problem.torque_at_rows(found.effect, found.axis)
+            suspects.append(_Suspect((placed,), torque_nm, found.coefficients, found.held_out_fall))
+    if any(isinstance(found.effect, CLOCK) for found in passed):
+        late = find_late_currents(problem, of_currents, rates_nm_s)
+        if late is not None:
+            before = float(problem.folds.square_sum(problem.folds.residual).sum())
+            fall = before - float(late.held_out.sum())
+            suspects.append(_Suspect(late.effects, late.torque_nm, late.seconds, fall))
+    return tuple(sorted(suspects, key=lambda one: -one.held_out_fall))
 
 
-def _explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:
-    """Whether a correction explains most of what it does beside an effect of one axis, too."""
-    of_rival = problem.torque_at_rows(rival.effect, rival.axis)
-    of_correction = problem.torque_at_rows(correction.effect, correction.axis)
-    alone, both = problem.trials([of_rival, np.concatenate((of_rival, of_correction), axis=1)])
+def _rivals(
+    evidence: Evidence,
+    problem: SearchProblem,
+    tested: Sequence[FamilyTrials],
+    suspects: Sequence[_Suspect],
+    rng: np.random.Generator,
+    gates: Gates,
+) -> _Rivals:
+    """Test everything that the suspects compete with, and they themselves, each beside all others.
+
+    A late current also competes with what is fast on its axis: presliding, a gear with a gap or a spring in it.
+    """
+    families = (*tested, *_tested(problem, _slow(EFFECTS)))
+    late: set[int] = set()
+    for suspect in suspects:
+        if suspect.is_of_currents:
+            late |= {placed.axis for placed in suspect.effects if placed.effect.has_axis}
+    at_full_rate = _columns_at_full_rate(evidence, sorted(late)) if late else {}
+    of_fast = problem.trials(at_full_rate.values())
+    fast: list[FamilyTrials] = []
+    for placed, trial in zip(at_full_rate, of_fast, strict=True):
+        if trial is not None:
+            fast.append(FamilyTrials(placed.axis, ((placed.effect, trial),)))
+    return _Rivals(rank_families(problem, (*families, *fast), rng, gates), at_full_rate)
+
+
+def _mistakes(
+    evidence: Evidence, problem: SearchProblem, suspects: Sequence[_Suspect], rivals: _Rivals
+) -> tuple[Finding, ...]:
+    """The best suspect that stands beside all rivals, and in the joint fit; nothing where none does."""
+    for suspect in suspects:
+        own = rivals.findings_of(suspect.effects)
+        if not any(found.passed for found in own):
+            continue
+        best = suspects[0]
+        if suspect is not best and not _explains_beside(problem, suspect, best.torque_nm):
+            continue
+        if not _stands_beside(problem, suspect, own, rivals):
+            continue
+        settled = _settled(evidence, suspect, own)
+        if settled:
+            return settled
+    return ()
+
+
+def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Finding], rivals: _Rivals) -> bool:
+    """Whether a suspect explains more than every rival, or most of it beside the best.
+
+    A late current must do so beside the effects of its own axis, too. Delays of currents do not compete with each
+    other: they were fitted together.
+
+    Args:
+        problem: around the fit.
+        suspect: the mistake.
+        own: the finding of each of its effects alone.
+        rivals: everything else.
+    """
+    others = rivals.others(suspect)
+    best = others[0]
+    is_best = suspect.held_out_fall >= best.held_out_fall
+    if not is_best and not _explains_beside(problem, suspect, rivals.torque_nm(problem, best)):
+        return False
+    if not suspect.is_of_currents:
+        return True
+    for index, found in enumerate(own):
+        of_axis = [other for other in others if _is_of_axis(other, found)]
+        if of_axis and of_axis[0].held_out_fall > found.held_out_fall:
+            alone = replace(suspect, torque_nm=suspect.torque_nm[:, [index]], held_out_fall=found.held_out_fall)
+            if not _explains_beside(problem, alone, rivals.torque_nm(problem, of_axis[0])):
+                return False
+    return True
+
+
+def _is_of_axis(other: Finding, found: Finding) -> bool:
+    """Whether a finding is an effect of the axis of another one, and corrects nothing of the whole arm."""
+    is_same = found.effect.has_axis and other.axis == found.axis
+    return is_same and not isinstance(other.effect, GeometryEffect)
+
+
+def _explains_beside(problem: SearchProblem, suspect: _Suspect, rival_nm: FloatArray) -> bool:
+    """Whether a suspect explains most of what it does beside a rival, too."""
+    alone, both = problem.trials([rival_nm, np.concatenate((rival_nm, suspect.torque_nm), axis=1)])
     if alone is None or both is None:
         return False
     fall = float(alone.held_out.sum() - both.held_out.sum())
-    return fall >= OWN_SHARE * correction.held_out_fall
+    return fall >= OWN_SHARE * suspect.held_out_fall
 
 
-def _gravity(findings: Sequence[Finding], declared_m_s2: FloatArray) -> Gravity | None:
-    """The direction of gravity among findings."""
-    for found in findings:
-        if isinstance(found.effect, GravityDirection):
-            turn = found.coefficients
-            angle = float(np.linalg.norm(turn))
-            # σ along the turn that was found, its two components taken as independent; of no turn at all, any.
-            along = turn / angle if angle > 0.0 else np.array([1.0, 0.0])
-            return Gravity(
-                declared_m_s2=declared_m_s2,
-                found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),
-                turn_rad=angle,
-                turn_std_rad=float(np.linalg.norm(along * found.deviations)),
-            )
-    return None
+def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> tuple[Finding, ...]:
+    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct; nothing where it falls.
+
+    Its column is for small mistakes. The fit must show it by its own σ, within what is possible; and instruments from
+    the demanded motion must not show that a disturbance in the position loop looks like it. A mistake without such a
+    fit has no size that could be reported.
+
+    Args:
+        evidence: without it.
+        suspect: the mistake.
+        own: the finding of each of its effects alone.
+    """
+    try:
+        if suspect.is_of_currents:
+            corrected = with_delays(evidence, suspect.effects, suspect.values)
+        else:
+            corrected = with_effects(evidence, (*evidence.effects, *suspect.effects))
+    except UNFITTED:
+        return ()
+    estimate = corrected.estimate
+    shown: list[Finding] = []
+    for found, placed in zip(own, corrected.effects[-len(own) :], strict=True):
+        values, deviations = coefficients_of(estimate, placed)
+        if impossible(placed.effect.coefficients, values, deviations):
+            continue
+        if suspect.is_of_currents and abs(float(values[0])) < LEAST_DELAY_S:
+            continue
+        if in_noise(values, _covariance_of(estimate, placed), SHOWN):
+            continue
+        if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
+            continue
+        shown.append(replace(found, effect=placed.effect, coefficients=values, deviations=deviations))
+    return tuple(shown)
+
+
+def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
+    """Covariance of the coefficients of an effect in a fit, shape (p, p)."""
+    place = len(estimate.gains) + own_unknowns(estimate, (placed,))
+    return estimate.covariance[np.ix_(place, place)]
+
+
+def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
+    """The direction of gravity by a fit of it together with everything else; None where that fit shows none."""
+    placed = PlacedEffect(GravityDirection(), 0)
+    torque_nm = problem.torque_at_rows(placed.effect, placed.axis)
+    (trial,) = problem.trials([torque_nm])
+    if trial is None:
+        return None
+    training = evidence.training.extended(placed.columns, torque_nm)
+    try:
+        estimate = estimate_with(Method.ML, training.system(), fixed_gains(evidence))
+    except UNFITTED:
+        return None
+    declared_m_s2 = evidence.model.robot.gravity_m_s2
+    turn, _ = coefficients_of(estimate, placed)
+    angle = float(np.linalg.norm(turn))
+    # σ along the turn that was found; of no turn at all, any.
+    along = turn / angle if angle > 0.0 else np.array([1.0, 0.0])
+    covariance_rad2 = _covariance_of(estimate, placed)
+    return Gravity(
+        declared_m_s2=declared_m_s2,
+        found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),
+        turn_rad=angle,
+        turn_std_rad=float(np.sqrt(along @ covariance_rad2 @ along)),
+        covariance_rad2=covariance_rad2,
+    )
+
+
+def _hidden_zeros(findings: Sequence[Finding], robot: Robot) -> tuple[int, ...]:
+    """Axes whose zero could be wrong by 2°, or 6 mm, without being named."""
+    std_of = {found.axis: float(found.deviations[0]) for found in findings if isinstance(found.effect, ZeroOffset)}
+    hidden: list[int] = []
+    for axis, joint in enumerate(robot.axes):
+        largest = SEEN_ZERO_M if joint.kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
+        if is_placeable(ZeroOffset(), axis, robot) and std_of.get(axis, np.inf) > largest:
+            hidden.append(axis)
+    return tuple(hidden)
 
 
 def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tuple[FamilyTrials, ...]:
@@ -143,6 +364,34 @@ def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tup
 def _slow(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
     """Families whose columns can be built at the rows."""
     return tuple(family for family in families if family[0].abscissa in AT_ROWS and not family[0].needs_inertia)
+
+
+def _fast(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
+    """Families of one axis that look like a late current and are built at full rate."""
+    found: list[Sequence[Effect]] = []
+    for family in families:
+        effect = family[0]
+        is_through_links = effect.needs_inertia and effect.has_axis
+        if effect.abscissa is Abscissa.DISTANCE or is_through_links:
+            found.append(family)
+    return tuple(found)
+
+
+def _columns_at_full_rate(evidence: Evidence, axes: Sequence[int]) -> dict[PlacedEffect, FloatArray]:
+    """Columns of the fast effects of some axes at the joints, shape (m, p, r) each."""
+    model = evidence.model
+    conditioning = evidence.conditioning
+    began_s = session_began_s(evidence.fit_runs)
+    placed: list[PlacedEffect] = []
+    for family in _fast(EFFECTS):
+        for axis in axes:
+            placed += [PlacedEffect(one, axis) for one in family if is_placeable(one, axis, model.robot)]
+    parts: dict[PlacedEffect, list[FloatArray]] = {one: [] for one in placed}
+    for data in evidence.fit_runs:  # one after the other: signals at full rate are large
+        signals = fitted_signals(model, data, evidence.training, evidence.estimate, began_s)
+        for one in placed:
+            parts[one].append(effect_torque(one.effect, one.axis, (signals,), (data,), conditioning, model))
+    return {one: np.concatenate(own, axis=-1) for one, own in parts.items()}
 
 
 def _problem_at_rows(evidence: Evidence) -> SearchProblem:

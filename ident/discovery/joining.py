@@ -111,7 +111,7 @@ def join(
     if keys_of(pruned.evidence) in seen:
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
     last = PlacedEffect(accepted.effect, accepted.axis)
-    why = "" if pruned is joined else _refuted_by_instruments(pruned.evidence, last)
+    why = "" if pruned is joined else refuted_by_instruments(pruned.evidence, last)
     return SetAside(accepted, why) if why else pruned
 
 
@@ -156,10 +156,10 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     try:
         first_order = with_first_order_effects(evidence, (*evidence.effects, last), problem.runs)
         # Asked here: after it, the linearised problem would take memory beside the instruments.
-        if why := _refuted_by_instruments(first_order, last):
+        if why := refuted_by_instruments(first_order, last):
             return SetAside(accepted, why)
         refitted = settled_corrections(first_order)
-        if refitted is not first_order and (why := _refuted_by_instruments(refitted, last)):
+        if refitted is not first_order and (why := refuted_by_instruments(refitted, last)):
             return SetAside(accepted, why)
         joined = linearised_after(refitted, model)
         joined = _all_resettled(joined) if is_correction(last) else resettled(joined)
@@ -230,7 +230,7 @@ def as_joined(accepted: Finding, evidence: Evidence) -> Finding:
     return replace(accepted, effect=next(found, accepted.effect))
 
 
-def _refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
+def refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
 
     A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain

@@ -107,7 +107,7 @@ class ZeroOffset(GeometryEffect):
         position = arm.motion.position_rad.copy()
         position[:, axis] += POSITION_STEP
         # Not the load of the signals: filtered, it is not quite that of a filtered motion.
-        change = arm.load(replace(arm.motion, position_rad=position)) - arm.load(arm.motion)
+        change = arm.load_change(replace(arm.motion, position_rad=position))
         return change[:, None] / POSITION_STEP
 
 
@@ -233,7 +233,7 @@ class LatePosition(GeometryEffect):
         velocity[:, axis] += TIME_STEP_S * motion.acceleration_rad_s2[:, axis]
         acceleration[:, axis] += TIME_STEP_S * jerk
         # Dry friction jumps where the joint turns back; there the joint rests, and rows at rest do not count.
-        change = arm.smooth_torque(Motion(position, velocity, acceleration)) - arm.smooth_torque(motion)
+        change = arm.smooth_torque_change(Motion(position, velocity, acceleration))
         return change[:, None] / TIME_STEP_S
 
 
@@ -273,7 +273,10 @@ def require_arm(signals: Signals) -> Arm:
 
 
 def across(gravity_m_s2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors across gravity and each other, shape (3,) each; x and y of the base where gravity is along z."""
+    """Two unit vectors across gravity and each other, shape (3,) each.
+
+    Of gravity along −z they are x and y of the base, of gravity along +z, as of an arm that hangs, x and −y.
+    """
     along = gravity_m_s2 / np.linalg.norm(gravity_m_s2)
     other = np.eye(3)[int(np.argmin(np.abs(along)))]
     first = other - along * float(along @ other)

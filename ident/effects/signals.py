@@ -54,13 +54,25 @@ class Arm:
     model: Model  #: the model, with the corrections that were applied to it
     standard: FloatArray  #: standard parameters, those of the mounted payload on the flange, shape (c,)
     motion: Motion  #: of the axes over k samples
+    #: Torques of `motion` itself, from which the derivative to every zero, or every delay, begins.
+    _kept: dict[str, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
-    def load(self, motion: Motion) -> FloatArray:
-        """Torque for links and payload of another motion [Nm or N], shape (m, k)."""
+    def load_change(self, motion: Motion) -> FloatArray:
+        """Torque for links and payload of another motion, less that of this one [Nm or N], shape (m, k)."""
+        if "load" not in self._kept:
+            self._kept["load"] = self._load(self.motion)
+        return self._load(motion) - self._kept["load"]
+
+    def smooth_torque_change(self, motion: Motion) -> FloatArray:
+        """Whole torque of another motion without dry friction, less that of this one [Nm or N], shape (m, k)."""
+        if "smooth" not in self._kept:
+            self._kept["smooth"] = self._smooth_torque(self.motion)
+        return self._smooth_torque(motion) - self._kept["smooth"]
+
+    def _load(self, motion: Motion) -> FloatArray:
         return self.model.torques(motion, self.standard)[0]
 
-    def smooth_torque(self, motion: Motion) -> FloatArray:
-        """Whole torque of another motion without dry friction, in joint units [Nm or N], shape (m, k)."""
+    def _smooth_torque(self, motion: Motion) -> FloatArray:
         smooth = self.standard.copy()
         smooth[self.model.dry_friction_columns] = 0.0
         smooth[JOINT_COLUMNS * self.model.robot.joint_count + 2 :: 3] = 0.0

@@ -57,5 +57,15 @@ THREE_AXES = _chain(
     ),
 )
 """Two links in a vertical plane on a turntable: all that a search needs, at a third of the time."""
+POLAR = _chain(
+    "polar",
+    (
+        ("revolute", "0 0 0.4", "0 0 0", "0 0 1"),
+        ("revolute", "0 0 0.2", "0 0 0", "0 1 0"),
+        ("prismatic", "0 0 0.4", "0 0 0", "0 0 1"),
+        ("revolute", "0 0 0.3", "0 0 0", "0 1 0"),
+    ),
+)
+"""A slide along the arm, between the joints that carry it and a wrist."""
 TX40 = Arm("tx40", (CONFIGS / "robots" / "tx40.urdf").read_text())
 ARMS = (TX40, SEVEN_AXES, GANTRY)

@@ -24,7 +24,7 @@ from ident.estimators.maximum_likelihood import ml
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
-from tests.ident.arms import GANTRY, THREE_AXES, TX40
+from tests.ident.arms import GANTRY, POLAR, THREE_AXES, TX40
 
 FloatArray = NDArray[np.float64]
 
@@ -84,6 +84,14 @@ def gantry_truth() -> Truth:
     offset_n = [20.0, -15.0, 10.0]
     parameters[[13, 27, 41]] = offset_n
     return Truth(model, parameters, np.array([60.0, 55.0, 70.0, 8.0, 6.0]))
+
+
+def polar_truth() -> Truth:
+    """A turntable, a joint that lifts the arm, a slide along it, and a wrist."""
+    model = Model(robot_from_urdf(POLAR.urdf), DriveTrain(np.diag([40.0, 50.0, 120.0, 40.0])))
+    friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (3.0, 20.0, 15.0), (0.02, 1.6, 4.0))
+    parameters = _parameters(model, (12.0, 8.0, 5.0, 3.0), friction, np.random.default_rng(2))
+    return Truth(model, parameters, np.array([33.0, 32.0, 60.0, 15.0]))
 
 
 def _parameters(

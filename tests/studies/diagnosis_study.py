@@ -33,6 +33,7 @@ from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed, with_gravity
 from tests.ident.mistaken import AXES, BODY, SMALL, small_recordings, turned, with_currents
 from tests.ident.recordings import FloatArray, Truth, three_axes_truth
+from tests.studies.planted_mistakes import late
 
 NOISES_A = (0.02, 0.05, 0.1, 0.15)
 LIMIT_NM = np.full(3, 99.0)
@@ -94,12 +95,32 @@ def named(
 
 
 def of_description(found: Identification) -> list[str]:
-    """What the test of the description beside a fit names: the effect and its axis."""
+    """What the test of description and clock beside a fit names: each effect and its axis."""
     check = geometry_beside(gather(found), BOOTSTRAP_SEED)
-    if check is None or check.mistake is None:
-        return []
-    placed = PlacedEffect(check.mistake.effect, check.mistake.axis)
-    return [placed.name_among(AXES)]
+    mistakes = () if check is None else check.mistakes
+    return [PlacedEffect(one.effect, one.axis).name_among(AXES) for one in mistakes]
+
+
+def delayed(
+    truth: Truth,
+    seed: int,
+    fixed: bool,
+    *,
+    currents: Sequence[int] = (),
+    positions: Sequence[int] = (),
+    delay_ms: float = 3.0,
+) -> list[str]:
+    """Diagnoses where the currents or positions of some axes are late; NOISES_A in turn."""
+    runs = []
+    for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
+        current = run.current_a.copy()
+        position = run.position_rad.copy()
+        for axis in currents:
+            current[:, axis] = late(run.time_s, current[:, axis], 1e-3 * delay_ms)
+        for axis in positions:
+            position[:, axis] = late(run.time_s, position[:, axis], 1e-3 * delay_ms)
+        runs.append(replace(run, current_a=current, position_rad=position))
+    return named(truth, runs, fixed=fixed)
 
 
 def offset(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
@@ -185,6 +206,14 @@ MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "zero of J2 off by 20 degrees": lambda t, s, f: offset(t, s, f, 20.0),
     "zero of J2 off by 90 degrees": lambda t, s, f: offset(t, s, f, 90.0),
     "base tilted by 3 degrees": lambda t, s, f: tilted(t, s, f, 3.0),
+    "all currents late by 3 ms": lambda t, s, f: delayed(t, s, f, currents=(0, 1, 2)),
+    "all positions late by 3 ms": lambda t, s, f: delayed(t, s, f, positions=(0, 1, 2)),
+    "current of J1 late by 3 ms": lambda t, s, f: delayed(t, s, f, currents=(0,)),
+    "current of J2 late by 3 ms": lambda t, s, f: delayed(t, s, f, currents=(1,)),
+    "current of J3 late by 5 ms": lambda t, s, f: delayed(t, s, f, currents=(2,), delay_ms=5.0),
+    "currents of J1 and J2 late by 3 ms": lambda t, s, f: delayed(t, s, f, currents=(0, 1)),
+    "position of J2 late by 3 ms": lambda t, s, f: delayed(t, s, f, positions=(1,)),
+    "position of J3 late by 5 ms": lambda t, s, f: delayed(t, s, f, positions=(2,), delay_ms=5.0),
     "position of J2 reversed": lambda t, s, f: counted(t, s, f, 1, 1.0),
     "position of J3 reversed": lambda t, s, f: counted(t, s, f, 2, 1.0),
     "position and current of J3 reversed": lambda t, s, f: counted(t, s, f, 2, -1.0),

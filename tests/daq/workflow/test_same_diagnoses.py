@@ -64,7 +64,8 @@ conditioning:
 """
 
 RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
-FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in {"stribeck", "load-friction", "spring"})
+FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
+FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
 """What a search tries here beside the corrections of the description: what is diagnosed hangs on none of it."""
 Runs = list[Run]
 Mistake = Callable[[Runs], Runs]
@@ -112,6 +113,17 @@ def offset(run: Run, degrees: float = 4.0) -> Run:
     return replace(run, position_rad=run.position_rad + np.array([0.0, np.radians(degrees), 0.0]))
 
 
+def late_currents(*delays_s: float) -> Mistake:
+    """Currents that were stamped too late, by so much on each axis."""
+
+    def change(run: Run) -> Run:
+        columns = zip(run.current_a.T, delays_s, strict=True)
+        late = [np.interp(run.time_s - delay_s, run.time_s, current) for current, delay_s in columns]
+        return replace(run, current_a=np.stack(late, axis=1))
+
+    return lambda runs: [change(run) for run in runs]
+
+
 def without_zero(run: Run) -> Run:
     """A run after the encoder of J2 has lost its zero."""
     return offset(run, degrees=10.0)
@@ -149,6 +161,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "position of J2 reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
     "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
     "zero of J2 off": (lambda runs: [offset(run) for run in runs], "zero-off J2"),
+    "all currents late": (late_currents(0.004, 0.004, 0.004), "time-skew"),
+    "current of J1 late": (late_currents(0.01, 0.0, 0.0), "current-late J1"),
     "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
     "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),

@@ -12,16 +12,33 @@ from numpy.typing import NDArray
 from ident.calibration import calibration_of
 from ident.data.run import Run
 from ident.discovery.before_after import account, left_out_runs
-from ident.discovery.evidence import Evidence, coefficients_of, with_effects, without_effects
+from ident.discovery.evidence import Evidence, coefficients_of, gather, with_effects, without_effects
 from ident.discovery.gates import Gates
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, rotation_by
+from ident.effects.geometry_corrections import (
+    GravityDirection,
+    LatePosition,
+    ZeroOffset,
+    rotation_by,
+    turn_between,
+)
+from ident.estimators.identify import identify
 from ident.model.model import Model
 from ident.prediction import predict_current
 from ident.weighing import weigh
-from tests.ident.recordings import MOUNTED, PAYLOAD_TRUTH, Truth, gantry_truth, gathered, record, three_axes_truth
+from tests.ident.mistaken import SMALL, small_recordings
+from tests.ident.recordings import (
+    MOUNTED,
+    PAYLOAD_TRUTH,
+    Truth,
+    gantry_truth,
+    gathered,
+    polar_truth,
+    record,
+    three_axes_truth,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -120,6 +137,71 @@ def test_the_check_beside_a_fit_names_it_too(mistake: Mistake) -> None:
     assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
 
 
+@dataclass(frozen=True)
+class Delays:
+    """What is recorded late, and what must be said of it: effect, axis and delay."""
+
+    said: tuple[tuple[str, int, float], ...]
+    positions_ms: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    currents_ms: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+DELAYS = {
+    "all currents": Delays((("time-skew", 0, 3.0),), currents_ms=(3.0, 3.0, 3.0)),
+    "all positions": Delays((("time-skew", 0, -3.0),), positions_ms=(3.0, 3.0, 3.0)),
+    "all currents by 1 ms": Delays((("time-skew", 0, 1.0),), currents_ms=(1.0, 1.0, 1.0)),
+    "current of J1": Delays((("lag", 0, 3.0),), currents_ms=(3.0, 0.0, 0.0)),
+    "current of J2": Delays((("lag", 1, 3.0),), currents_ms=(0.0, 3.0, 0.0)),
+    "current of J2, early": Delays((("lag", 1, -3.0),), currents_ms=(0.0, -3.0, 0.0)),
+    "current of J3": Delays((("lag", 2, 5.0),), currents_ms=(0.0, 0.0, 5.0)),
+    "currents of J1 and J2": Delays((("lag", 0, 3.0), ("lag", 1, 3.0)), currents_ms=(3.0, 3.0, 0.0)),
+    "currents of J2 and J3": Delays((("lag", 1, 5.0), ("lag", 2, 5.0)), currents_ms=(0.0, 5.0, 5.0)),
+    "position of J1": Delays((("late-position", 0, 3.0),), positions_ms=(3.0, 0.0, 0.0)),
+    "position of J2": Delays((("late-position", 1, 3.0),), positions_ms=(0.0, 3.0, 0.0)),
+    "position of J3": Delays((("late-position", 2, 3.0),), positions_ms=(0.0, 0.0, 3.0)),
+    "position of J3, early": Delays((("late-position", 2, -3.0),), positions_ms=(0.0, 0.0, -3.0)),
+}
+
+
+def _delayed(run: Run, delays: Delays) -> Run:
+    def late(values: FloatArray, delays_ms: tuple[float, ...]) -> FloatArray:
+        moved = [
+            np.interp(run.time_s - 1e-3 * delay_ms, run.time_s, own)
+            for own, delay_ms in zip(values.T, delays_ms, strict=True)
+        ]
+        return np.stack(moved, axis=1)
+
+    return replace(
+        run,
+        position_rad=late(run.position_rad, delays.positions_ms),
+        current_a=late(run.current_a, delays.currents_ms),
+    )
+
+
+@pytest.mark.parametrize("name", DELAYS)
+def test_the_check_names_what_is_late_with_its_delay(name: str) -> None:
+    """A late current, a skew of all channels and a late encoder look alike, and each has another remedy."""
+    delays = DELAYS[name]
+    runs = tuple(_delayed(run, delays) for run in _runs()[:4])
+    found = check_geometry(gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES).mistakes
+    assert [(one.effect.name, one.axis) for one in found] == [(effect, axis) for effect, axis, _ in delays.said]
+    for one, (_, _, delay_ms) in zip(found, delays.said, strict=True):
+        assert abs(one.coefficients[0] - 1e-3 * delay_ms) < 3.0 * one.deviations[0] < 1e-3
+
+
+def test_undeclared_friction_is_no_late_current() -> None:
+    """A friction that saturates with the speed changes where the torque does, on its axis alone."""
+    truth = three_axes_truth()
+    runs: list[Run] = []
+    for run in _runs()[:4]:
+        current = run.current_a.copy()
+        velocity = np.gradient(run.position_rad[:, 1], run.time_s)
+        current[:, 1] += 4.0 * np.tanh(velocity / 0.3) / truth.gains[1]
+        runs.append(replace(run, current_a=current))
+    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES)
+    assert found.mistakes == ()
+
+
 @pytest.mark.parametrize("zero_deg", [-15.0, 30.0])
 def test_the_check_gives_a_large_zero_its_size(zero_deg: float) -> None:
     """The column of a zero is for small ones: by it alone, 30° are 35 ± 1°."""
@@ -137,6 +219,50 @@ def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() ->
     assert check.hidden_zeros == (0, 2)  # about the vertical, and behind the last joint
     assert check.gravity is not None
     assert check.gravity.turn_rad < 4.0 * check.gravity.turn_std_rad < np.radians(0.5)
+
+
+def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
+    """Over clean cells, each component of the turn is as far from zero as its σ says."""
+    truth = three_axes_truth()
+    far: list[FloatArray] = []
+    for seed in range(30):
+        runs = small_recordings(truth, 1000 + seed)
+        evidence = gather(identify(truth.model, runs, SMALL, keep_rows=True))
+        gravity = check_geometry(evidence, np.random.default_rng(0), GATES).gravity
+        assert gravity is not None
+        turn = turn_between(gravity.declared_m_s2, gravity.found_m_s2)
+        far.append(turn / np.sqrt(np.diag(gravity.covariance_rad2)))
+        along = turn / np.linalg.norm(turn)
+        assert gravity.turn_std_rad == pytest.approx(np.sqrt(along @ gravity.covariance_rad2 @ along))
+    assert 0.8 < np.sqrt(np.mean(np.square(far))) < 1.2
+
+
+def test_a_slide_between_two_joints_shows_millimetres_of_its_zero() -> None:
+    """What is mounted behind the wrist is weighed, so the slide's zero is a lever that the first joints feel."""
+    truth = polar_truth()
+    rng = np.random.default_rng(5)
+    moved = np.array([0.0, 0.0, 0.006, 0.0])
+    recorded = [
+        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
+    ]
+    runs = tuple(replace(run, position_rad=run.position_rad + moved) for run in recorded)
+    found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
+    assert found.hidden_zeros == (0, 3)
+    assert found.mistake is not None
+    assert (found.mistake.effect.name, found.mistake.axis) == ("zero-offset", 2)
+    assert abs(found.mistake.coefficients[0] + 0.006) < 3.0 * found.mistake.deviations[0] < 0.0012
+
+
+def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> None:
+    rng = np.random.default_rng(9)
+    truth = gantry_truth()
+    runs = tuple(
+        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
+    )
+    found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
+    assert {0, 1, 2} <= set(found.hidden_zeros)
 
 
 def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:

@@ -1,0 +1,96 @@
+"""What a technician reads of currents that are late: each cause has a remedy of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell, model_of
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.workflow.diagnoses import check_diagnoses, hidden_zeros_text, vector_text
+from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.search import Finding
+from ident.effects.effect import Effect
+from ident.effects.electrical import Lag, TimeSkew
+from ident.effects.geometry_corrections import LatePosition
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return load_cell(shipped_configurations() / "cells" / "tx40.yaml")
+
+
+def _finding(effect: Effect, axis: int, seconds: float) -> Finding:
+    return Finding(
+        effect=effect,
+        axis=axis,
+        coefficients=np.array([seconds]),
+        deviations=np.array([7e-5]),
+        probability=0.001,
+        folds_better=1.0,
+        explained=0.3,
+        error_before_percent=2.0,
+        error_after_percent=1.0,
+        error_fall=0.5,
+        held_out_fall=100.0,
+        passed=True,
+        fold_errors=np.ones(8),
+    )
+
+
+def _checked(*found: Finding) -> GeometryCheck:
+    return GeometryCheck(gravity=None, mistake=found[0], hidden_zeros=(), also_late=found[1:])
+
+
+def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
+    (one,) = check_diagnoses(_checked(_finding(TimeSkew(), 0, 0.003)), cell, model_of(cell))
+    assert (one.name, one.axes) == ("time-skew", ())
+    assert one.found == "all currents late by 3.00 ± 0.07 ms beside the positions, the same on every axis"
+    assert "how positions and currents are stamped" in one.remedy
+    assert "no single encoder or drive is late" in one.remedy
+
+
+def test_an_early_skew_is_said_to_be_early(cell: Cell) -> None:
+    (one,) = check_diagnoses(_checked(_finding(TimeSkew(backwards=1), 0, -0.003)), cell, model_of(cell))
+    assert "all currents early by 3.00 ± 0.07 ms" in one.found
+
+
+def test_each_late_current_is_named_on_its_axis(cell: Cell) -> None:
+    first = _finding(Lag(filter_s=0.0015), 0, 0.003)
+    second = _finding(Lag(filter_s=0.0015), 1, 0.003)
+    diagnoses = check_diagnoses(_checked(first, second), cell, model_of(cell))
+    assert [(one.name, one.axes) for one in diagnoses] == [
+        ("current-late", cell.axis_names[:1]),
+        ("current-late", cell.axis_names[1:2]),
+    ]
+    for one in diagnoses:
+        assert one.found == f"the current of {one.axes[0]} late by 3.00 ± 0.07 ms"
+        assert "what delays this current alone" in one.remedy
+        assert "encoder" not in one.remedy
+
+
+def test_a_late_encoder_asks_for_the_encoder(cell: Cell) -> None:
+    (one,) = check_diagnoses(_checked(_finding(LatePosition(), 2, 0.003)), cell, model_of(cell))
+    assert one.name == "position-late"
+    assert "what delays this encoder alone" in one.remedy
+
+
+def test_no_mistake_has_no_diagnosis_whatever_else_was_late(cell: Cell) -> None:
+    check = replace(_checked(_finding(Lag(), 0, 0.003), _finding(Lag(), 1, 0.003)), mistake=None)
+    assert check_diagnoses(check, cell, model_of(cell)) == ()
+
+
+def test_a_direction_of_gravity_is_written_as_finely_as_it_is_known() -> None:
+    """A hundredth of a degree is 0.0017 m/s²."""
+    turned = vector_text(np.array([-0.0001, 9.81 * np.sin(np.radians(0.01)), -9.81]))
+    assert turned == "[0.000, 0.002, -9.810]"
+
+
+def test_the_reason_for_hidden_zeros_holds_for_slides_too() -> None:
+    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(0, 2))
+    said = hidden_zeros_text(check, ("X", "Y", "A"))
+    assert said.startswith("These data do not show the zeros of X and A")
+    assert "most slides" in said
