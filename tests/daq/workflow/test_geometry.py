@@ -330,10 +330,8 @@ def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) 
     finding = _finding(place)
     (one,) = geometry_diagnoses(finding, CELL, applied=False)
     assert (one.name, one.axes) == ("place-off", ())
-    assert (
-        "the place of crank-3 on the base off by -0.3000 ± 0.0001 mm in y (to be added to it) explains alone"
-        in one.found
-    )
+    off = "the place of crank-3 on the base off by -0.3000 ± 0.0001 mm in y (to be added to it)"
+    assert f"{off} explains alone" in one.found
     joints = {joint.name: joint for joint in model_of(CELL).robot.joints}
     described_mm = 1e3 * float(joints["crank-3"].translation_m[1])
     assert f"{described_mm - 0.3:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
