@@ -114,7 +114,7 @@ def diagnose_fit(
         CurrentUnsigned: drives report the size of their currents only.
     """
     nameplate = nameplate_of(cell)
-    turned = turned_geometry(recordings, instants, found.training_error.total)
+    turned = turned_geometry(recordings, instants, found.training_error.total, found.model)
     if turned is not None:
         return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
@@ -166,7 +166,10 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
 
 
 def turned_geometry(
-    recordings: Recordings, instants: Sequence[Instants], error_percent: float | None
+    recordings: Recordings,
+    instants: Sequence[Instants],
+    error_percent: float | None,
+    corrected: Model | None = None,
 ) -> Diagnosis | None:
     """Another geometry that explains recordings clearly better, confirmed by a fit of all rows; None without any.
 
@@ -174,11 +177,15 @@ def turned_geometry(
         recordings: of the fit.
         instants: a few rows of each; taken from the logs where there are none.
         error_percent: of the fit as declared; None where it was refused.
+        corrected: model of the fit, as a search has corrected it. Where no other geometry explains the recordings
+            better than this one, the search has named what is wrong, with σ.
     """
     _, cell = recordings.read(recordings.logs[0])
     model = model_of(cell)
     nameplate = nameplate_of(cell)
     rows = instants or read_instants(model, recordings.runs(), cell.conditioning)
+    if corrected is not None and find_turned_geometry(corrected, rows, nameplate) is None:
+        return None
     turned = find_turned_geometry(model, rows, nameplate)
     if turned is None or not is_confirmed(
         turned,
