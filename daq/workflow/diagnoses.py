@@ -39,11 +39,14 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
+from ident.discovery.search import Finding
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
 from ident.equations.system import System
 from ident.errors import (
+    CORRECTION_UNCLEAR,
     ChannelsExchanged,
     Diagnosis,
     EffectImpossible,
@@ -65,7 +68,7 @@ from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
-from ident.model.robot import JointKind
+from ident.model.robot import JointKind, Robot
 from ident.model.urdf import read_urdf
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
@@ -297,16 +300,17 @@ def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Dia
     found = check.mistake
     if found is None:
         return ()
-    placed = PlacedEffect(found.effect, found.axis)
-    return (_correction_diagnosis(placed, found.coefficients, found.deviations, cell, model),)
+    diagnosis = _finding_diagnosis(found, cell, model)
+    return (_beside_alike(diagnosis, PlacedEffect(found.effect, found.axis), check, cell, model),)
 
 
-def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...]:
+def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | None = None) -> tuple[Diagnosis, ...]:
     """Diagnoses of the corrections that a search has made.
 
     Args:
         evidence: with its effects.
         cell: whose description it is.
+        check: beside the fit before the search; None where nothing was tested.
     """
     if evidence.uncorrected is None:
         return ()
@@ -314,8 +318,53 @@ def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...
     for placed in evidence.effects:
         if is_correction(placed):
             values, deviations = coefficients_of(evidence.estimate, placed)
-            found.append(_correction_diagnosis(placed, values, deviations, cell, evidence.uncorrected.model))
+            declared = evidence.uncorrected.model
+            diagnosis = _correction_diagnosis(placed, values, deviations, cell, declared)
+            if check is not None:
+                diagnosis = _beside_alike(diagnosis, placed, check, cell, declared)
+            found.append(diagnosis)
     return tuple(found)
+
+
+def _finding_diagnosis(found: Finding, cell: Cell, model: Model) -> Diagnosis:
+    """Diagnosis of a correction that a test has found."""
+    placed = PlacedEffect(found.effect, found.axis)
+    return _correction_diagnosis(placed, found.coefficients, found.deviations, cell, model)
+
+
+def _beside_alike(
+    diagnosis: Diagnosis, placed: PlacedEffect, check: GeometryCheck, cell: Cell, model: Model
+) -> Diagnosis:
+    """The same diagnosis, with the corrections that the moves do not tell apart from its own, and what to record.
+
+    Args:
+        diagnosis: of one correction.
+        placed: this correction.
+        check: beside the fit.
+        cell: whose description it is.
+        model: as declared.
+    """
+    places = [PlacedEffect(one.effect, one.axis) for one in check.alike]
+    if placed not in places:
+        return diagnosis
+    others = [
+        _finding_diagnosis(one, cell, model) for one, place in zip(check.alike, places, strict=True) if place != placed
+    ]
+    expected = dict.fromkeys((diagnosis.expected, *(one.expected for one in others)))
+    axes = dict.fromkeys((*diagnosis.axes, *(axis for one in others for axis in one.axes)))
+    wanted = "moves at other speeds and in other poses"
+    if check.axes_to_move:
+        names = " and ".join(cell.place_names[axis] for axis in check.axes_to_move)
+        wanted = f"moves in which {names} turn{'s' if len(check.axes_to_move) == 1 else ''} further"
+    return replace(
+        diagnosis,
+        name=CORRECTION_UNCLEAR,
+        axes=tuple(axes),
+        found=f"either {' or '.join(one.found for one in (diagnosis, *others))}: these moves do not tell them apart",
+        expected=" and ".join(expected),
+        remedy=f"record {wanted}, and fit them together with these; or measure which of them is wrong; correct nothing "
+        "in the cell file before that",
+    )
 
 
 def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
@@ -425,13 +474,26 @@ def vector_text(vector: FloatArray) -> str:
     return f"[{', '.join(f'{entry:.2f}' for entry in vector)}]"
 
 
-def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
-    """Which zeros the data cannot show; empty where they show all, or were not asked."""
+WHY_HIDDEN = {
+    ZeroHiddenBy.SYMMETRY: "another one turns or shifts the whole arm, and no torque depends on that",
+    ZeroHiddenBy.LAST_LINK: "no joint is behind it, and another one makes the same torques as another body there",
+    ZeroHiddenBy.MOVES: "these moves do not show it",
+}
+"""Why the zero of a joint is not seen, in words."""
+
+
+def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> str:
+    """Which zeros the data do not show, and why; empty where they show all, or were not asked.
+
+    Args:
+        check: beside the fit.
+        axes: their names.
+        robot: as declared.
+    """
     if check is None or not check.hidden_zeros:
         return ""
-    names = [axes[axis] for axis in check.hidden_zeros]
-    subject = "The zeros of" if len(names) > 1 else "The zero of"
-    return (
-        f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
-        "another zero makes nearly the same torques."
-    )
+    hidden: dict[ZeroHiddenBy, list[str]] = {}
+    for axis in check.hidden_zeros:
+        hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
+    parts = [f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}" for cause in ZeroHiddenBy if cause in hidden]
+    return f"Zeros that are not seen here: {'; '.join(parts)}."

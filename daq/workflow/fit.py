@@ -376,7 +376,7 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
     has_searched = any(not step.declared for step in fitted.steps)
     if has_searched:
-        return correction_diagnoses(fitted.steps[-1].after, fitted.cell)
+        return correction_diagnoses(fitted.steps[-1].after, fitted.cell, fitted.description)
     if fitted.description is None:
         return ()
     return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)

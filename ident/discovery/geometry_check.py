@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, with_effects
 from ident.discovery.gates import Gates
@@ -30,7 +31,9 @@ AT_ROWS = frozenset(
 )
 """Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
 SEEN_ZERO = 0.02  #: Largest σ of a zero that the data show, 1.1° or 20 mm; usual are some hundredths of a degree
-OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
+LEAST_SETTLED_STD = 0.1
+"""Least σ of a correction in the joint fit, in that of its column. Where gravity leans and a joint hardly moves, a base
+parameter of the corrected robot is the same column as the turn itself, and leaves it a σ of rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +53,9 @@ class GeometryCheck:
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
     mistake: Finding | None  #: the correction that the data ask for; None where they ask for none
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
+    #: The mistake and the corrections that the data do not tell apart from it; empty where the mistake stands alone.
+    alike: tuple[Finding, ...] = ()
+    axes_to_move: tuple[int, ...] = ()  #: axes that must turn further, so that other data tell these apart
 
 
 def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
@@ -73,10 +79,14 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         rivals = rank_families(problem, (*tested, *_tested(problem, _slow(EFFECTS))), rng, gates)
         best = max(rivals, key=lambda found: found.held_out_fall)
         is_best = (best.effect, best.axis) == (mistake.effect, mistake.axis)
-        if not is_best and not _explains_beside(problem, mistake, best):
+        if not is_best and not explains_beside(problem, mistake, best):
             mistake = None
+    alike: tuple[Finding, ...] = ()
     if mistake is not None:
+        others = alike_corrections(problem, mistake, findings)
         mistake = _settled(evidence, mistake)
+        if others:
+            alike = (mistake, *(_settled(evidence, other) for other in others))
     zeros = [found for found in findings if isinstance(found.effect, ZeroOffset)]
     shown = {found.axis for found in zeros if found.deviations[0] < SEEN_ZERO}
     robot = evidence.model.robot
@@ -85,6 +95,8 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         gravity=_gravity(findings, robot.gravity_m_s2),
         mistake=mistake,
         hidden_zeros=tuple(axis for axis in can_be_wrong if axis not in shown),
+        alike=alike,
+        axes_to_move=axes_to_move([PlacedEffect(one.effect, one.axis) for one in alike], robot, evidence.fit_runs),
     )
 
 
@@ -97,18 +109,9 @@ def _settled(evidence: Evidence, mistake: Finding) -> Finding:
         return mistake
     applied = corrected.effects[-1]
     values, deviations = coefficients_of(corrected.estimate, applied)
+    if np.any(deviations < LEAST_SETTLED_STD * mistake.deviations):
+        return mistake
     return replace(mistake, coefficients=values, deviations=deviations)
-
-
-def _explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:
-    """Whether a correction explains most of what it does beside an effect of one axis, too."""
-    of_rival = problem.torque_at_rows(rival.effect, rival.axis)
-    of_correction = problem.torque_at_rows(correction.effect, correction.axis)
-    alone, both = problem.trials([of_rival, np.concatenate((of_rival, of_correction), axis=1)])
-    if alone is None or both is None:
-        return False
-    fall = float(alone.held_out.sum() - both.held_out.sum())
-    return fall >= OWN_SHARE * correction.held_out_fall
 
 
 def _gravity(findings: Sequence[Finding], declared_m_s2: FloatArray) -> Gravity | None:

@@ -77,6 +77,12 @@ RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations t
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
 TURN_ROUNDS = 6  #: Of Gauss-Newton
 LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
+UNTIL_RIGHT = "gains and errors mean nothing until it is right"  #: End of each remedy
+WHICH_IS_WRONG = (
+    "these moves do not tell them apart: look how the base is mounted and where the zeros are, or record moves through "
+    f"more of the range of all joints; correct what is wrong, and fit again: {UNTIL_RIGHT}"
+)
+"""Remedy where several explain the same."""
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
 """Parameters of a body that gravity acts on: first moments and mass."""
 
@@ -161,6 +167,10 @@ class TurnedGeometry:
         others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
+            remedy = (
+                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
+                f"these recordings; {UNTIL_RIGHT}"
+            )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
             return Diagnosis(
                 GRAVITY_TURNED,
@@ -169,21 +179,23 @@ class TurnedGeometry:
                 f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
                 f"the cell says, with {errors}, {declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
-                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
-                "these recordings; gains and errors mean nothing until it is right",
+                WHICH_IS_WRONG if alike else remedy,
             )
         reading = self.readings[0]
         name = axes[reading.axis]
         if reading.sign > 0.0:
             turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
+            remedy = (
+                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
+                f"controller, and fit again: {UNTIL_RIGHT}"
+            )
             return Diagnosis(
                 ZERO_TURNED,
                 runs,
                 (name,),
                 f"{reading.text(axes)}: so read, its position leaves {errors}, {declared}{others}",
                 "positions whose zero is that of the URDF",
-                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
-                "controller, and fit again: gains and errors mean nothing until it is right",
+                WHICH_IS_WRONG if alike else remedy,
             )
         if reading.axis in self.reversed_currents:
             remedy = (
@@ -201,7 +213,7 @@ class TurnedGeometry:
             (name,),
             f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
             "each position to count about the axis of its joint in the URDF",
-            f"{remedy}; gains and errors mean nothing until it is right",
+            f"{remedy}; {UNTIL_RIGHT}",
         )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
-from ident.errors import Diagnosis
+from ident.errors import CORRECTION_UNCLEAR, Diagnosis
 from ident.plausible import format_at_limit
 
 NOISE = 1.01
@@ -82,6 +82,8 @@ def _is_uncorrected(diagnosis: Diagnosis, calibration: Calibration) -> bool:
     misfit = calibration.encoder_misfit
     if misfit is not None and diagnosis.name in BY_ENCODERS:
         return bool(misfit.corrections) and not misfit.applied
+    if diagnosis.name == CORRECTION_UNCLEAR:
+        return not any(effect.name in CORRECTED_BY.values() for effect in calibration.effects)
     if diagnosis.name not in CORRECTED_BY:
         return False
     for effect in calibration.effects:
