@@ -271,7 +271,7 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     alike.sort(key=lambda one: (one.contradictions(gains), one.gravity is None, -one.fall(before)))
     chosen = alike[0]
     fewest = chosen.contradictions(gains)
-    alike += [one for one in small if one.is_better(before) and not chosen.is_better(one)]
+    alike += [one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)]
     readings = [one.reading for one in alike if one.reading is not None and one.contradictions(gains) == fewest]
     against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
     return TurnedGeometry(

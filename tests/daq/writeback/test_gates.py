@@ -352,6 +352,7 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.DESCRIPTION, "J2", _corrected("zero-offset", diagnosis_named("zero-off", "J2"))),  # corrects that of J3
     (Gate.DESCRIPTION, "J2", _by_encoders(applied=False)),
     (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-tilted"))),
+    (Gate.DESCRIPTION, "J2", _diagnosed(diagnosis_named("correction-unclear", "J2"))),
     (Gate.DESCRIPTION, "calibration", _diagnosed(diagnosis_named("gravity-turned"))),
     (Gate.DESCRIPTION, "J3", _diagnosed(diagnosis_named("position-late", "J3"))),
     (Gate.DESCRIPTION, "J3", _diagnosed(diagnosis_named("position-reversed", "J3"))),
@@ -478,6 +479,7 @@ def test_the_table_lists_every_gate_once_with_its_description() -> None:
         _calibration(effects=()),
         _corrected("zero-offset", diagnosis_named("zero-off", "J3")),
         _corrected("gravity-direction", diagnosis_named("gravity-tilted")),
+        _corrected("gravity-direction", diagnosis_named("correction-unclear", "J3")),
         _corrected("late-position", diagnosis_named("position-late", "J3")),
         _diagnosed(diagnosis_named("zero-off", "J2", runs=("held-out",))),
         _diagnosed(diagnosis_named("gain-off-nameplate", "J2")),

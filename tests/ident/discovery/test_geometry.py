@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from ident.calibration import calibration_of
 from ident.data.run import Run
 from ident.discovery.before_after import account, left_out_runs
-from ident.discovery.evidence import Evidence, coefficients_of, with_effects, without_effects
+from ident.discovery.evidence import Evidence, coefficients_of, gather, with_effects, without_effects
 from ident.discovery.gates import Gates
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, rotation_by
+from ident.estimators.identify import identify
 from ident.model.model import Model
 from ident.prediction import predict_current
 from ident.weighing import weigh
+from tests.ident.mistaken import SMALL
 from tests.ident.recordings import MOUNTED, PAYLOAD_TRUTH, Truth, gantry_truth, gathered, record, three_axes_truth
 
 FloatArray = NDArray[np.float64]
@@ -137,6 +139,44 @@ def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() ->
     assert check.hidden_zeros == (0, 2)  # about the vertical, and behind the last joint
     assert check.gravity is not None
     assert check.gravity.turn_rad < 4.0 * check.gravity.turn_std_rad < np.radians(0.5)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_mistake_that_wide_moves_show_stands_alone(mistake: Mistake) -> None:
+    assert _checked(mistake).alike == ()
+
+
+def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2() -> None:
+    """One of the two was named alone, with a σ of a twelfth of its size."""
+    truth = three_axes_truth()
+    robot = truth.model.robot
+    lean = rotation_by(np.array([0.0, TILT_RAD, 0.0])) @ robot.gravity_m_s2
+    leaning = replace(truth, model=Model(replace(robot, gravity_m_s2=lean), truth.model.drive_train))
+    rng = np.random.default_rng(8)
+    less = np.array([0.06, 1.0, 1.0])
+    runs: list[Run] = []
+    for number, payload in enumerate((None, MOUNTED, None, MOUNTED)):
+        runs.append(
+            record(
+                truth,
+                f"run {number}",
+                rng,
+                seconds=15.0,
+                rate_hz=500.0,
+                noise_a=0.1,
+                payload=payload,
+                bend=lambda q: q * less,
+            )
+        )
+    fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)  # the gain of J1 is not seen
+    check = check_geometry(gather(fixed, runs), np.random.default_rng(0), GATES)
+    assert check.mistake is not None
+    named = {(one.effect.name, one.axis) for one in check.alike}
+    assert named == {("gravity-direction", 0), ("zero-offset", 1)}
+    for one in check.alike:
+        assert np.degrees(np.linalg.norm(one.coefficients)) == pytest.approx(2.0, abs=0.5)
+        assert np.degrees(np.max(one.deviations)) > 0.01  # a lost direction would have none
+    assert check.axes_to_move == (0,)
 
 
 def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
