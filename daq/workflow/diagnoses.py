@@ -17,8 +17,9 @@ The order of the judgements, causes before their traces:
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
 6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
    degrees of freedom: found before any torque is looked at, and named first.
-7. Small mistakes of the description (`check_diagnoses`): zeros, mounting and late positions, by torque. They are named
-   before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+7. Small mistakes of the description (`check_diagnoses`): zeros, mounting and late positions, by torque. Several that
+   the moves do not tell apart are one diagnosis, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and where they
+   are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 """
 

@@ -17,7 +17,8 @@ best by Gauss-Newton. σ of the direction comes from leaving out parts of the mo
 
 **Readings.** A position is read the other way, or from another zero: descriptions differ in whether an arm stands
 upright or lies at zero. The search begins at zeros in steps of 45° and goes on from the best; a small zero offset is
-an effect of the description (`ident.effects.geometry.ZeroOffset`), whose linear column does not lead so far.
+an effect of the description (`ZeroOffset` of `ident.effects.geometry_corrections`), whose linear column does not lead
+so far.
 
 **Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is predicted from a fit of
 the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts. It
