@@ -170,14 +170,19 @@ class EffectImpossible(EffectRefused):
     """The data give a declared effect a coefficient that physics does not allow."""
 
 
+CORRECTION_UNCLEAR = "correction-unclear"
+"""Diagnosis of a description that is wrong, where the moves do not tell which of several corrections is right."""
+GAIN_UNSEEN = "gain-unseen"  #: Diagnosis of a gain that the moves hardly show
+
+
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
-    #: One of axis-error, axis-idle, channels-exchanged, current-late, current-off-scale, current-reversed,
-    #: estimators-disagree, gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned,
-    #: length-off, payload-differs, place-off, position-late, position-reversed, time-skew, torque-above-limit,
-    #: zero-off, zero-turned.
+    #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-late, current-off-scale,
+    #: current-reversed, estimators-disagree, gain-off-nameplate, gain-unseen, geometry-off, gravity-tilted,
+    #: gravity-turned, ill-conditioned, length-off, payload-differs, place-off, position-late, position-reversed,
+    #: time-skew, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

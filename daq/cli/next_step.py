@@ -40,6 +40,18 @@ def say_correct_first() -> None:
     typer.echo("Next: correct the description as CHECK says, then fit the logs again.", err=True)
 
 
+def _say_record_more() -> None:
+    """Print on stderr that other moves come before every other step."""
+    typer.echo("Next: record the moves that CHECK asks for, then fit them together with these logs.", err=True)
+
+
+def _needs_other_moves(calibration: Calibration) -> bool:
+    """Whether the moves of a fit hardly show a gain, or do not tell what is wrong with the description."""
+    from ident.errors import CORRECTION_UNCLEAR, GAIN_UNSEEN
+
+    return any(one.name in (CORRECTION_UNCLEAR, GAIN_UNSEEN) for one in calibration.diagnoses)
+
+
 @dataclass(frozen=True, slots=True)
 class FolderRuns:
     """Valid runs of one cell in a folder, the oldest first."""
@@ -149,7 +161,7 @@ def say_after_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loade
 
 
 def say_after_fit(calibration: Calibration, arguments: Sequence[object], written: Path | None) -> None:
-    """Name the search for what the model lacks, unless the robot is described wrongly.
+    """Name the search for what the model lacks, unless the robot is described wrongly or other moves are needed.
 
     Args:
         calibration: of the fit.
@@ -158,6 +170,9 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], written
     """
     from daq.writeback.gates.fit import uncorrected_description
 
+    if _needs_other_moves(calibration):
+        _say_record_more()
+        return
     if uncorrected_description(calibration):
         say_correct_first()
         return
@@ -166,10 +181,15 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], written
 
 
 def say_after_calibration(calibration: Calibration, file: Path, logs: Sequence[Path], cell: Path | None) -> None:
-    """Name the dry run that shows what would be written, unless the gains were held or the description is wrong."""
+    """Name the dry run that shows what would be written.
+
+    It is not named where the gains were held, the description is wrong, or other moves are needed.
+    """
     from daq.writeback.gates.fit import uncorrected_description
 
-    if uncorrected_description(calibration):
+    if _needs_other_moves(calibration):
+        _say_record_more()
+    elif uncorrected_description(calibration):
         say_correct_first()
     elif not calibration.gains_fixed:  # every gate of such gains is closed
         say_next("drivegain", "apply", cell or cell_of(calibration, logs), file)

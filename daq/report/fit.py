@@ -11,6 +11,7 @@ from pydantic import Field
 from rich.console import RenderableType
 from rich.table import Table
 
+from daq.config.cell import robot_of
 from daq.documents.calibration_file import CalibrationBody, as_document
 from daq.errors import counted
 from daq.report import paper_tables
@@ -35,11 +36,13 @@ from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
+from ident.model.robot import Robot
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 
 
@@ -109,6 +112,8 @@ class CheckedGeometry(Report):
 
     gravity: FoundGravity | None
     hidden_zeros: list[str]
+    #: Why each of them is hidden: by a symmetry of the arm, as the last link's, or by these moves.
+    hidden_zero_causes: dict[str, ZeroHiddenBy]
 
 
 class FitReport(CalibrationBody, Report):
@@ -181,7 +186,7 @@ def fit_view(
     )
     notes = (
         *sigma_notes(fitted),
-        *geometry_notes(fitted.description, axes),
+        *geometry_notes(fitted.description, axes, robot_of(fitted.cell)),
         *identifiability_notes(fitted, calibration.payload_mass),
         *advice(fitted, needed_verdicts(fitted)),
     )
@@ -273,7 +278,7 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
         FitReport,
         calibration,
         compared=compared,
-        geometry=checked_geometry(fitted.description, axes),
+        geometry=checked_geometry(fitted.description, axes, robot_of(fitted.cell)),
         removed=_removed(found),
         verdicts=[
             GainWords.of(gain, axis=axes[gain.axis], seen_by=gain.sources, words=gain.words(axes[gain.axis]))
@@ -391,12 +396,13 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
     yield f"{mistake}{masses} A gear efficiency that is the same in both directions is part of its gain."
 
 
-def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator[str]:
+def geometry_notes(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> Iterator[str]:
     """Say the direction of gravity, and the zeros that the data do not show; nothing where nothing was tested.
 
     Args:
         check: beside the fit.
         axes: their names.
+        robot: as declared.
     """
     if check is None:
         return
@@ -404,12 +410,12 @@ def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator
         turn = np.degrees(check.gravity.turn_rad)
         std = np.degrees(check.gravity.turn_std_rad)
         yield f"By the torques, gravity is {turn:.2f} ± {std:.2f}° from its direction in the cell file."
-    hidden = hidden_zeros_text(check, axes)
+    hidden = hidden_zeros_text(check, axes, robot)
     if hidden:
         yield hidden
 
 
-def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> CheckedGeometry | None:
+def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> CheckedGeometry | None:
     """Return what the torques say of the description of the robot; None where nothing was tested."""
     if check is None:
         return None
@@ -418,7 +424,8 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str]) -> Checke
         turn_deg = np.degrees(check.gravity.turn_rad)
         turn_std_deg = np.degrees(check.gravity.turn_std_rad)
         gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
-    return CheckedGeometry(gravity=gravity, hidden_zeros=[axes[axis] for axis in check.hidden_zeros])
+    causes = {axes[axis]: zero_hidden_by(robot, axis) for axis in check.hidden_zeros}
+    return CheckedGeometry(gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes)
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:

@@ -19,8 +19,9 @@ The order of the judgements, causes before their traces:
    degrees of freedom: found before any torque is looked at, and named first.
 7. Small mistakes of the description: zeros, mounting and late positions, by torque. Beside a fit they are those of
    `check_diagnoses`; after a search, those that it corrects (`correction_diagnoses`), those that held-out runs leave
-   undecided or that it has set aside (`open_correction_diagnoses`), and what the check says beside its model. They are
-   named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+   undecided or that it has set aside (`open_correction_diagnoses`), and what the check says beside its model. Several
+   that the moves do not tell apart are one, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and where they are,
+   no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 
 Currents that are late, one of them or all alike, are named with 7., but they hide no exchange of currents.
@@ -45,13 +46,16 @@ from ident.data.run import Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.discovery.loop import Step
+from ident.discovery.search import Finding
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
 from ident.equations.system import System
 from ident.errors import (
+    CORRECTION_UNCLEAR,
     ChannelsExchanged,
     Diagnosis,
     EffectImpossible,
@@ -73,7 +77,7 @@ from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
-from ident.model.robot import JointKind
+from ident.model.robot import JointKind, Robot
 from ident.model.urdf import read_urdf
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
@@ -122,7 +126,7 @@ def diagnose_fit(
         CurrentUnsigned: drives report the size of their currents only.
     """
     nameplate = nameplate_of(cell)
-    turned = turned_geometry(recordings, instants, found.training_error.total)
+    turned = turned_geometry(recordings, instants, found.training_error.total, found.model)
     if turned is not None:
         return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
@@ -174,7 +178,10 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
 
 
 def turned_geometry(
-    recordings: Recordings, instants: Sequence[Instants], error_percent: float | None
+    recordings: Recordings,
+    instants: Sequence[Instants],
+    error_percent: float | None,
+    corrected: Model | None = None,
 ) -> Diagnosis | None:
     """Another geometry that explains recordings clearly better, confirmed by a fit of all rows; None without any.
 
@@ -182,11 +189,15 @@ def turned_geometry(
         recordings: of the fit.
         instants: a few rows of each; taken from the logs where there are none.
         error_percent: of the fit as declared; None where it was refused.
+        corrected: model of the fit, as a search has corrected it. Where no other geometry explains the recordings
+            better than this one, the search has named what is wrong, with σ.
     """
     _, cell = recordings.read(recordings.logs[0])
     model = model_of(cell)
     nameplate = nameplate_of(cell)
     rows = instants or read_instants(model, recordings.runs(), cell.conditioning)
+    if corrected is not None and find_turned_geometry(corrected, rows, nameplate) is None:
+        return None
     turned = find_turned_geometry(model, rows, nameplate)
     if turned is None or not is_confirmed(
         turned,
@@ -298,23 +309,28 @@ def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Dia
     diagnoses: list[Diagnosis] = []
     for found in check.mistakes:
         placed = PlacedEffect(found.effect, found.axis)
-        diagnoses.append(_correction_diagnosis(placed, found.coefficients, found.deviations, cell, model))
+        diagnosis = _finding_diagnosis(found, cell, model)
+        diagnoses.append(_beside_alike(diagnosis, placed, check, cell, model))
     return tuple(diagnoses)
 
 
-def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...]:
+def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | None = None) -> tuple[Diagnosis, ...]:
     """Diagnoses of the corrections that a search has made, and of the late currents that it has found.
 
     Args:
         evidence: with its effects.
         cell: whose description it is.
+        check: beside the fit before the search; None where nothing was tested.
     """
     given = evidence.uncorrected or evidence
     found: list[Diagnosis] = []
     for placed in evidence.effects[evidence.declared :]:
         if type(placed.effect) in CORRECTED_BY:
             values, deviations = coefficients_of(evidence.estimate, placed)
-            found.append(_correction_diagnosis(placed, values, deviations, cell, given.model))
+            diagnosis = _correction_diagnosis(placed, values, deviations, cell, given.model)
+            if check is not None:
+                diagnosis = _beside_alike(diagnosis, placed, check, cell, given.model)
+            found.append(diagnosis)
     return tuple(found)
 
 
@@ -371,6 +387,47 @@ def _open_correction(
     return replace(diagnosis, found=f"{diagnosis.found}; the gains are without this correction ({why})")
 
 
+def _finding_diagnosis(found: Finding, cell: Cell, model: Model) -> Diagnosis:
+    """Diagnosis of a correction that a test has found."""
+    placed = PlacedEffect(found.effect, found.axis)
+    return _correction_diagnosis(placed, found.coefficients, found.deviations, cell, model)
+
+
+def _beside_alike(
+    diagnosis: Diagnosis, placed: PlacedEffect, check: GeometryCheck, cell: Cell, model: Model
+) -> Diagnosis:
+    """The same diagnosis, with the corrections that the moves do not tell apart from its own, and what to record.
+
+    Args:
+        diagnosis: of one correction.
+        placed: this correction.
+        check: beside the fit.
+        cell: whose description it is.
+        model: as declared.
+    """
+    places = [PlacedEffect(one.effect, one.axis) for one in check.alike]
+    if placed not in places:
+        return diagnosis
+    others = [
+        _finding_diagnosis(one, cell, model) for one, place in zip(check.alike, places, strict=True) if place != placed
+    ]
+    expected = dict.fromkeys((diagnosis.expected, *(one.expected for one in others)))
+    axes = dict.fromkeys((*diagnosis.axes, *(axis for one in others for axis in one.axes)))
+    wanted = "moves at other speeds and in other poses"
+    if check.axes_to_move:
+        names = " and ".join(cell.place_names[axis] for axis in check.axes_to_move)
+        wanted = f"moves in which {names} turn{'s' if len(check.axes_to_move) == 1 else ''} further"
+    return replace(
+        diagnosis,
+        name=CORRECTION_UNCLEAR,
+        axes=tuple(axes),
+        found=f"either {' or '.join(one.found for one in (diagnosis, *others))}: these moves do not tell them apart",
+        expected=" and ".join(expected),
+        remedy=f"record {wanted}, and fit them together with these; or measure which of them is wrong; correct nothing "
+        "in the cell file before that",
+    )
+
+
 def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
     """Diagnosis of a geometry that has changed since a calibration.
 
@@ -409,7 +466,7 @@ CORRECTED_BY: dict[type[Effect], str] = {
     TimeSkew: "time-skew",
 }
 """Diagnosis of a wrong description, or of currents that are late, by the effect that corrects it."""
-OF_DESCRIPTION = frozenset({"zero-off", "position-late", "gravity-tilted"})
+OF_DESCRIPTION = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
 """Those of a wrong description, which may look like exchanged currents."""
 SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
 INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"
@@ -500,14 +557,26 @@ def vector_text(vector: FloatArray) -> str:
     return f"[{', '.join(f'{entry:.3f}' for entry in rounded)}]"
 
 
-def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
-    """Which zeros the data cannot show; empty where they show all, or were not asked."""
+WHY_HIDDEN = {
+    ZeroHiddenBy.SYMMETRY: "another one turns or shifts the whole arm, and no torque depends on that",
+    ZeroHiddenBy.LAST_LINK: "no joint is behind it, and another one makes the same torques as another body there",
+    ZeroHiddenBy.MOVES: "these moves do not show it",
+}
+"""Why the zero of a joint is not seen, in words."""
+
+
+def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> str:
+    """Which zeros the data do not show, and why; empty where they show all, or were not asked.
+
+    Args:
+        check: beside the fit.
+        axes: their names.
+        robot: as declared.
+    """
     if check is None or not check.hidden_zeros:
         return ""
-    names = [axes[axis] for axis in check.hidden_zeros]
-    subject = "the zeros of" if len(names) > 1 else "the zero of"
-    return (
-        f"These data do not show {subject} {' and '.join(names)}: with another zero, and link parameters to match, the "
-        "torques are nearly the same. So it is with a joint about the vertical, with the last joint, and with most "
-        "slides."
-    )
+    hidden: dict[ZeroHiddenBy, list[str]] = {}
+    for axis in check.hidden_zeros:
+        hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
+    parts = [f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}" for cause in ZeroHiddenBy if cause in hidden]
+    return f"Zeros that are not seen here: {'; '.join(parts)}."

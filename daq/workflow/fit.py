@@ -403,7 +403,7 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     found: list[Diagnosis] = []
     has_searched = any(not step.declared for step in fitted.steps)
     if has_searched:
-        found += correction_diagnoses(fitted.steps[-1].after, fitted.cell)
+        found += correction_diagnoses(fitted.steps[-1].after, fitted.cell, fitted.description)
         found += open_correction_diagnoses(fitted.steps, fitted.cell)
     if fitted.description is not None:
         found += check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.discovery.alike_corrections import OWN_SHARE, alike_corrections, axes_to_move
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
@@ -46,7 +47,9 @@ CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one
 SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
 SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
 LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
-OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside the best effect of one axis
+LEAST_SETTLED_STD = 0.1
+"""Least σ of a correction in the joint fit, in that of its column. Where gravity leans and a joint hardly moves, a base
+parameter of the corrected robot is the same column as the turn itself, and leaves it a σ of rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,9 @@ class GeometryCheck:
     mistake: Finding | None
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
     also_late: tuple[Finding, ...] = ()  #: the other late currents, where the mistake is one of several
+    #: The mistake and the corrections that the data do not tell apart from it; empty where the mistake stands alone.
+    alike: tuple[Finding, ...] = ()
+    axes_to_move: tuple[int, ...] = ()  #: axes that must turn further, so that other data tell these apart
 
     @property
     def mistakes(self) -> tuple[Finding, ...]:
@@ -147,12 +153,36 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         suspects = _suspects(problem, findings, of_currents, rates_nm_s)
         rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
         mistakes = _mistakes(evidence, problem, suspects, rivals)
+    robot = evidence.model.robot
+    alike = _alike(evidence, problem, mistakes, findings)
     return GeometryCheck(
         gravity=_gravity(evidence, problem),
         mistake=mistakes[0] if mistakes else None,
-        hidden_zeros=_hidden_zeros(findings, evidence.model.robot),
+        hidden_zeros=_hidden_zeros(findings, robot),
         also_late=mistakes[1:],
+        alike=alike,
+        axes_to_move=axes_to_move([PlacedEffect(one.effect, one.axis) for one in alike], robot, evidence.fit_runs),
     )
+
+
+def _alike(
+    evidence: Evidence, problem: SearchProblem, mistakes: Sequence[Finding], findings: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """The mistake and the corrections that the data do not tell apart from it; empty where it stands alone."""
+    if not mistakes or not isinstance(mistakes[0].effect, GeometryEffect):
+        return ()
+    mistake = mistakes[0]
+    corrections = [found for found in findings if isinstance(found.effect, GeometryEffect)]
+    # Among corrections alone: what the moves do not tell apart from a mistake is told by its place among these.
+    (as_found,) = (one for one in corrections if (one.effect.name, one.axis) == (mistake.effect.name, mistake.axis))
+    others = alike_corrections(problem, as_found, corrections)
+    alike = [mistake]
+    for other in others:
+        placed = PlacedEffect(other.effect, other.axis)
+        torque_nm = problem.torque_at_rows(other.effect, other.axis)
+        settled = _settled(evidence, _Suspect((placed,), torque_nm, other.coefficients, other.held_out_fall), (other,))
+        alike.append(settled[0] if settled else other)
+    return tuple(alike) if others else ()
 
 
 def _suspects(
@@ -293,6 +323,9 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> t
     shown: list[Finding] = []
     for found, placed in zip(own, corrected.effects[-len(own) :], strict=True):
         values, deviations = coefficients_of(estimate, placed)
+        if np.any(deviations < LEAST_SETTLED_STD * found.deviations):
+            shown.append(found)
+            continue
         if impossible(placed.effect.coefficients, values, deviations):
             continue
         if suspect.is_of_currents and abs(float(values[0])) < LEAST_DELAY_S:

@@ -27,7 +27,7 @@ from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update, triangle
-from ident.errors import CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
+from ident.errors import GAIN_UNSEEN, CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
@@ -51,6 +51,10 @@ LARGEST_CONDITION = 1e6
 """Largest condition number. An error of one σ along the weakest direction of the parameters is 1/s_min, and it exceeds
 all parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated recordings."""
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0  #: Of another estimator's gain from that of ml: relative, and in σ of ml
+UNSEEN_SIGMAS = 2.0
+"""A gain that is less than this many σ from zero is no result. One that is less than GAIN_SIGMAS from it is none either
+where its sign or its size is not that of a drive."""
+ABSURD_RATIO = 3.0  #: Of a gain to its nameplate, or the inverse, that no tolerance of a drive explains
 SCALE_BLOCKS = 20  #: Stretches of a run of which each is left out once, for σ of the scale of a current
 CHANNEL_FALL = 0.4
 """Least fall of the logarithm of a motor's error with another current than its own. With any two currents of two real
@@ -144,7 +148,10 @@ def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
 
 
 def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]) -> Iterator[Diagnosis]:
-    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ."""
+    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ.
+
+    A gain that the moves hardly show is named as well where it may be zero, or where its number is absurd.
+    """
     ratio = estimate.gains / nameplate
     known = estimate.gains_std < np.abs(estimate.gains) / GAIN_SIGMAS
     for axis in np.flatnonzero(known & (ratio < 0.0)).tolist():
@@ -157,7 +164,20 @@ def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str
             "does the drive, or the import, count this current the other way?",
         )
     margin = GAIN_SIGMAS * np.abs(estimate.gains_std / nameplate)
-    for axis in np.flatnonzero(outside(np.abs(ratio), margin, GAIN_RANGE)).tolist():
+    is_off = outside(np.abs(ratio), margin, GAIN_RANGE)
+    is_absurd = (ratio < 0.0) | outside(np.abs(ratio), 0.0, (1.0 / ABSURD_RATIO, ABSURD_RATIO))
+    is_absurd |= np.abs(estimate.gains) < UNSEEN_SIGMAS * estimate.gains_std
+    for axis in np.flatnonzero(~known & ~is_off & is_absurd).tolist():
+        yield Diagnosis(
+            GAIN_UNSEEN,
+            (),
+            (axes[axis],),
+            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, nameplate {nameplate[axis]:.4g}",
+            f"a gain that is more than {GAIN_SIGMAS:g} σ from zero",
+            "these moves hardly show this gain: record faster and wider moves of this axis, loaded too, and fit them "
+            "together with these; do not use this gain",
+        )
+    for axis in np.flatnonzero(is_off).tolist():
         yield Diagnosis(
             "gain-off-nameplate",
             (),

@@ -20,7 +20,9 @@ upright or lies at zero. The search begins at zeros in steps of 45° and goes on
 an effect of the description (`ident.effects.geometry_corrections.ZeroOffset`): its linear column leads less far.
 
 **Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is predicted from a fit of
-the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts.
+the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts. It
+must do so beside each small correction as well: gravity that leans by some degrees, or a zero that is off by some. A
+large turn of one joint imitates them, where the joint moves little.
 """
 
 from __future__ import annotations
@@ -65,6 +67,8 @@ ZERO_TURNS_DEG = (45.0, 90.0, 135.0, 180.0, -135.0, -90.0, -45.0)
 """Zeros of a revolute joint from which the search begins."""
 ZERO_REACH_RAD = 0.5  #: How far it goes from there
 ZERO_TOLERANCE_RAD = 2e-3
+SMALL_ZERO = float(np.deg2rad(ZERO_TURNS_DEG[0])) - ZERO_REACH_RAD
+"""Largest small correction of a zero [rad or m]: from there on, the search for large ones finds it."""
 SUSPECT_ERROR = 0.2
 """Error of the worst current, of its size, from which another zero is looked for: 45° of a joint that bears anything
 leave more."""
@@ -73,6 +77,12 @@ RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations t
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
 TURN_ROUNDS = 6  #: Of Gauss-Newton
 LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
+UNTIL_RIGHT = "gains and errors mean nothing until it is right"  #: End of each remedy
+WHICH_IS_WRONG = (
+    "these moves do not tell them apart: look how the base is mounted and where the zeros are, or record moves through "
+    f"more of the range of all joints; correct what is wrong, and fit again: {UNTIL_RIGHT}"
+)
+"""Remedy where several explain the same."""
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
 """Parameters of a body that gravity acts on: first moments and mass."""
 
@@ -157,6 +167,10 @@ class TurnedGeometry:
         others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
+            remedy = (
+                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
+                f"these recordings; {UNTIL_RIGHT}"
+            )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
             return Diagnosis(
                 GRAVITY_TURNED,
@@ -165,21 +179,23 @@ class TurnedGeometry:
                 f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
                 f"the cell says, with {errors}, {declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
-                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
-                "these recordings; nothing else is judged until it is right",
+                WHICH_IS_WRONG if alike else remedy,
             )
         reading = self.readings[0]
         name = axes[reading.axis]
         if reading.sign > 0.0:
             turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
+            remedy = (
+                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
+                f"controller, and fit again: {UNTIL_RIGHT}"
+            )
             return Diagnosis(
                 ZERO_TURNED,
                 runs,
                 (name,),
                 f"{reading.text(axes)}: so read, its position leaves {errors}, {declared}{others}",
                 "positions whose zero is that of the URDF",
-                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
-                "controller, and fit again: nothing else is judged until it is right",
+                WHICH_IS_WRONG if alike else remedy,
             )
         if reading.axis in self.reversed_currents:
             remedy = (
@@ -197,7 +213,7 @@ class TurnedGeometry:
             (name,),
             f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
             "each position to count about the axis of its joint in the URDF",
-            f"{remedy}; nothing else is judged until it is right",
+            f"{remedy}; {UNTIL_RIGHT}",
         )
 
 
@@ -244,6 +260,10 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     better = [one for one in judged if one.is_better(before)]
     if not better:
         return None
+    small = _small_corrections(model, instants, weighed, start, reference)
+    better = [one for one in better if one.stands_beside(small)]
+    if not better:
+        return None
     best = max(one.fall(before) for one in better)
     alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
     # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a zero half a turn away
@@ -251,6 +271,7 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     alike.sort(key=lambda one: (one.contradictions(gains), one.gravity is None, -one.fall(before)))
     chosen = alike[0]
     fewest = chosen.contradictions(gains)
+    alike += [one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)]
     readings = [one.reading for one in alike if one.reading is not None and one.contradictions(gains) == fewest]
     against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
     return TurnedGeometry(
@@ -332,12 +353,9 @@ def _best_zero(
 
     def left(zero_rad: float) -> float:
         try:
-            products = products_of_reading(model, instants, PositionReading(axis, zero_rad=zero_rad), part_count=1)
+            return _left_with_zero(model, instants, axis, zero_rad, start, reference)
         except ModelError:  # the loops of a closed chain cannot be closed so
             return np.inf
-        square = products.square[:, 0]
-        rows = products.rows.sum(axis=1)
-        return _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS))
 
     begins = [one.zero_rad for one in _turned_zeros(model, axis)]
     levels = [left(zero_rad) for zero_rad in begins]
@@ -379,19 +397,106 @@ def _other_readings(
     return judged
 
 
+def _small_corrections(
+    model: Model, instants: Sequence[Instants], weighed: GravityProducts, start: MotorFit, reference: FloatArray
+) -> list[Judged]:
+    """Judge the best small correction of gravity, and of each zero; none that grows beyond what is small.
+
+    Args:
+        model: the declared model.
+        instants: rows of all runs.
+        weighed: products for any direction of gravity, of the same rows.
+        start: of the declared geometry.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    judged = list[Judged]()
+    declared = model.robot.gravity_m_s2
+    tilted = _judged_gravity(weighed, declared, _descended(weighed, declared, start, reference), reference)
+    if tilted.gravity is not None and tilted.gravity.turned_deg < SMALLEST_TURN_DEG:
+        judged.append(tilted)
+    few = _thinned(instants)
+    for axis in range(model.robot.axis_count):
+        try:
+            reading = _small_zero(model, few, axis, start, reference)
+            if reading is not None:
+                products = products_of_reading(model, instants, reading)
+                judged.append(replace(judge_hypothesis(products, start, reference), reading=reading))
+        except ModelError:  # the loops of a closed chain cannot be closed so
+            continue
+    return judged
+
+
+def _small_zero(
+    model: Model, instants: Sequence[Instants], axis: int, start: MotorFit, reference: FloatArray
+) -> PositionReading | None:
+    """The small correction of a zero whose fit leaves least; None where a larger one leaves less.
+
+    Arguments as for `_best_zero`.
+
+    Raises:
+        ModelError: the loops of a closed chain cannot be closed so.
+    """
+
+    def left(zero: float) -> float:
+        return _left_with_zero(model, instants, axis, zero, start, reference)
+
+    bounds = (-SMALL_ZERO, SMALL_ZERO)
+    found = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD})
+    zero = float(found.x)
+    is_at_bound = SMALL_ZERO - abs(zero) < 2.0 * ZERO_TOLERANCE_RAD
+    return None if is_at_bound else PositionReading(axis, zero_rad=zero)
+
+
+def _left_with_zero(
+    model: Model,
+    instants: Sequence[Instants],
+    axis: int,
+    zero: float,
+    start: MotorFit,
+    reference: FloatArray,
+) -> float:
+    """Logarithm of the motors' errors, in sum, where an axis is read from another zero [rad or m].
+
+    Arguments as for `_best_zero`.
+
+    Raises:
+        ModelError: the loops of a closed chain cannot be closed so.
+    """
+    products = products_of_reading(model, instants, PositionReading(axis, zero_rad=zero), part_count=1)
+    square = products.square[:, 0]
+    rows = products.rows.sum(axis=1)
+    return _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS))
+
+
 def _turned_gravity(
     weighed: GravityProducts, declared: FloatArray, start: MotorFit, reference: FloatArray
 ) -> Judged | None:
     """Judge the best direction of gravity; None where it is near the declared one, or uncertain."""
-    found, fit = best_gravity(weighed, declared, start, reference)
+    judged = _judged_gravity(weighed, declared, best_gravity(weighed, declared, start, reference), reference)
+    gravity = judged.gravity
+    if gravity is None or gravity.std_deg > LARGEST_DIRECTION_STD_DEG:
+        return None
+    return judged if gravity.turned_deg >= max(SMALLEST_TURN_DEG, 3.0 * gravity.std_deg) else None
+
+
+def _judged_gravity(
+    weighed: GravityProducts, declared: FloatArray, solution: tuple[FloatArray, MotorFit], reference: FloatArray
+) -> Judged:
+    """Judge a direction of gravity by predictions of each part of the moves, σ of it by a jackknife.
+
+    Args:
+        weighed: products for any direction of gravity.
+        declared: gravity of the model [m/s²], shape (3,).
+        solution: gravity that explains all rows best [m/s²], shape (3,), and its fit.
+        reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
+    """
+    found, fit = solution
     left_out = [_without(weighed, part, found, fit, reference) for part in range(PARTS)]
     directions = np.array([gravity for gravity, _ in left_out])
     unit = directions / np.linalg.norm(found)
     scatter = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
     std_deg = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(scatter)[-1])))
     gravity = GravityFound(declared, found, std_deg)
-    if gravity.turned_deg < max(SMALLEST_TURN_DEG, 3.0 * std_deg) or std_deg > LARGEST_DIRECTION_STD_DEG:
-        return None
     left = list[FloatArray]()
     for part, (of_others, fit_of_others) in enumerate(left_out):
         own = weighed.turned(weighed.square[:, part], of_others)
@@ -424,34 +529,45 @@ def best_gravity(
         start: of the declared geometry.
         reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
     """
-    square = weighed.square.sum(axis=1)
-    rows = weighed.rows.sum(axis=1)
-    size = float(np.linalg.norm(declared))
-
-    def fitted(gravity: FloatArray, near: MotorFit, rounds: int) -> tuple[float, MotorFit]:
-        turned = weighed.turned(square, gravity)
-        fit = improved(turned, rows, near, reference, rounds)
-        return _log_error(turned, fit), fit
-
-    level, fit = fitted(declared, start, NEXT_ROUNDS)
+    level, fit = _fit_under(weighed, declared, start, reference)
     gravity = declared
+    size = float(np.linalg.norm(declared))
     for direction in _grid():
         tried = size * direction
-        tried_level, tried_fit = fitted(tried, start, NEXT_ROUNDS)
+        tried_level, tried_fit = _fit_under(weighed, tried, start, reference)
         if tried_level < level:
             level = tried_level
             fit = tried_fit
             gravity = tried
+    return _descended(weighed, gravity, fit, reference)
+
+
+def _descended(
+    weighed: GravityProducts, gravity: FloatArray, near: MotorFit, reference: FloatArray
+) -> tuple[FloatArray, MotorFit]:
+    """Gravity that explains all rows best near another one, by Gauss-Newton, and its fit; arguments as before."""
+    square = weighed.square.sum(axis=1)
+    level, fit = _fit_under(weighed, gravity, near, reference)
     for _ in range(TURN_ROUNDS):
         step = weighed.turn(square, gravity, fit)
         following = _moved(gravity, step)
-        next_level, next_fit = fitted(following, fit, NEXT_ROUNDS)
+        next_level, next_fit = _fit_under(weighed, following, fit, reference)
         if not next_level < level:
             break
         level = next_level
         fit = next_fit
         gravity = following
     return gravity, fit
+
+
+def _fit_under(
+    weighed: GravityProducts, gravity: FloatArray, near: MotorFit, reference: FloatArray
+) -> tuple[float, MotorFit]:
+    """Fit all rows under a gravity: the logarithm of the motors' errors, in sum, and the fit."""
+    turned = weighed.turned(weighed.square.sum(axis=1), gravity)
+    rows = weighed.rows.sum(axis=1)
+    fit = improved(turned, rows, near, reference, NEXT_ROUNDS)
+    return _log_error(turned, fit), fit
 
 
 def _grid() -> list[FloatArray]:
@@ -561,6 +677,16 @@ class Judged:
         falls = 0.5 * np.sum(np.log(ratio), axis=0)
         std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
         return bool(np.mean(falls) > LEAST_T * std)
+
+    def stands_beside(self, small: Sequence[Judged]) -> bool:
+        """Whether a hypothesis is better than all small corrections; a turn of gravity, whether none is better than it.
+
+        Gravity that is turned by 15° is another explanation of the same size as a zero that is off by 15°. Where the
+        joints before this one hardly move, nothing tells the two apart.
+        """
+        if self.gravity is not None:
+            return not any(one.is_better(self) for one in small)
+        return all(self.is_better(one) for one in small)
 
     def contradictions(self, gains: FloatArray) -> float:
         """Number of currents with another sign than the nameplate.

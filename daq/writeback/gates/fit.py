@@ -12,7 +12,7 @@ from daq.workflow.geometry_diagnoses import LOOK_FOR, UNEXPLAINED, misfit_text
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
-from ident.errors import Diagnosis
+from ident.errors import CORRECTION_UNCLEAR, Diagnosis
 from ident.plausible import format_at_limit
 
 NOISE = 1.01
@@ -98,6 +98,8 @@ def _is_uncorrected(diagnosis: Diagnosis, calibration: Calibration) -> bool:
     misfit = calibration.encoder_misfit
     if misfit is not None and diagnosis.name in BY_ENCODERS:
         return bool(misfit.corrections) and not misfit.applied
+    if diagnosis.name == CORRECTION_UNCLEAR:
+        return not any(effect.name in CORRECTED_BY.values() for effect in calibration.effects)
     if diagnosis.name not in CORRECTED_BY:
         return False
     for effect in calibration.effects:

@@ -26,6 +26,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.workflow import plan as plan_module
 from daq.workflow.plan import Plan, load_plan, save_plan
+from ident.errors import Diagnosis
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
 from tests.pipeline.next_step import next_step
@@ -188,6 +189,18 @@ def test_a_calibration_is_followed_by_its_dry_run(
     assert fixed.gains_fixed
     say_after_calibration(fixed, Path("calibration.yaml"), [log], CELL)
     assert capsys.readouterr().err == ""
+
+
+def test_other_moves_come_before_a_search_and_a_write_where_a_gain_is_not_seen(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    unseen = Diagnosis("gain-unseen", (), ("J1",), "a gain of -63 ± 63", "a gain", "record faster moves")
+    found = replace(demo_calibration(), diagnoses=(unseen,))
+    say_after_fit(found, [], None)
+    say_after_calibration(found, Path("calibration.yaml"), [], CELL)
+    said = capsys.readouterr().err
+    assert said.count("Next: record the moves that CHECK asks for") == 2
+    assert "drivegain" not in said
 
 
 @pytest.mark.parametrize("simulated", [False, True])

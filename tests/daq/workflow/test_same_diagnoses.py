@@ -26,11 +26,13 @@ from daq.report.comparison import without_controller
 from daq.report.validation import validation_view
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
+from daq.workflow.diagnoses import hidden_zeros_text
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate
 from daq.writeback.gates.fit import uncorrected_description
 from ident.data.run import Run
 from ident.discovery.effect_verdict import Judgement
+from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step, find_effects
 from ident.discovery.search import Finding
@@ -42,7 +44,7 @@ from ident.estimators.turned_geometry import with_gravity
 from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
 from tests.ident.mistaken import small_recordings, turned, with_currents
-from tests.ident.recordings import three_axes_truth
+from tests.ident.recordings import MOUNTED, record, three_axes_truth
 
 WHEN = datetime(2025, 1, 2, tzinfo=UTC)
 CELL = """\
@@ -335,6 +337,60 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
     calibration = calibration_of(closed, WHEN)
     assert [one.name for one in uncorrected_description(calibration)] == ["zero-off"]
     assert np.all(closed.estimate.gains_std > fitted.estimate.gains_std)
+
+
+def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was "about -35 deg", and gains and held-out errors of the corrected robot followed."""
+    runs = {run.name: replace(offset(run, 35.0), digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    fitted = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True)
+    assert said(fitted.diagnoses) == {"zero-turned J2"}
+    assert "gains and errors mean nothing until it is right" in fitted.diagnoses[0].remedy
+    (found,) = close_loop(fitted, 0).diagnoses
+    assert (found.name, found.axes) == ("zero-off", ("J2",))
+    number, deviation = re.findall(r"([-+]\d+\.\d+) ± (\d+\.\d+)", found.found)[0]
+    assert abs(float(number) + 35.0) < 4.0 * float(deviation) < 2.0
+
+
+def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_to_be_typed_in(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = three_axes_truth()
+    lean = np.radians(2.0)
+    leaning = replace(truth, model=with_gravity(truth.model, 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)])))
+    rng = np.random.default_rng(8)
+    less = np.array([0.06, 1.0, 1.0])  # J1 hardly moves
+    runs: dict[str, Run] = {}
+    for number in range(4):
+        payload = MOUNTED if number % 2 else None
+        run = record(
+            leaning, f"r{number}", rng, payload, seconds=15.0, noise_a=0.1, rate_hz=500.0, bend=lambda q: q * less
+        )
+        runs[run.name] = replace(run, digest=f"{number:064x}")
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    fitted = fit([Path(f"r{number}") for number in range(4)], gains_fixed=True)
+    (found,) = fitted.diagnoses
+    assert (found.name, found.axes) == ("correction-unclear", ("J2",))
+    assert "the zero of J2 off by" in found.found
+    assert "gravity along" in found.found
+    assert "these moves do not tell them apart" in found.found
+    assert "record moves in which J1 turns further" in found.remedy
+    assert not re.search(r"\d\.\d", found.remedy)
+    say_after_fit(calibration_of(fitted, WHEN), [], None)
+    assert "Next: record the moves that CHECK asks for" in capsys.readouterr().err
+
+
+def test_each_hidden_zero_has_its_own_reason(cell: Cell) -> None:
+    robot = three_axes_truth().model.robot
+    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(0, 1, 2))
+    text = hidden_zeros_text(check, cell.axis_names, robot)
+    assert "of J1: another one turns or shifts the whole arm" in text
+    assert "of J3: no joint is behind it" in text
+    assert "of J2: these moves do not show it" in text
+    assert hidden_zeros_text(replace(check, hidden_zeros=()), cell.axis_names, robot) == ""
 
 
 def test_the_key_that_is_named_reverses_a_position_and_no_current(

@@ -265,6 +265,44 @@ def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> No
     assert {0, 1, 2} <= set(found.hidden_zeros)
 
 
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+def test_a_mistake_that_wide_moves_show_stands_alone(mistake: Mistake) -> None:
+    assert _checked(mistake).alike == ()
+
+
+def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2() -> None:
+    """One of the two was named alone, with a σ of a twelfth of its size."""
+    truth = three_axes_truth()
+    robot = truth.model.robot
+    lean = rotation_by(np.array([0.0, TILT_RAD, 0.0])) @ robot.gravity_m_s2
+    leaning = replace(truth, model=Model(replace(robot, gravity_m_s2=lean), truth.model.drive_train))
+    rng = np.random.default_rng(8)
+    less = np.array([0.06, 1.0, 1.0])
+    runs: list[Run] = []
+    for number, payload in enumerate((None, MOUNTED, None, MOUNTED)):
+        runs.append(
+            record(
+                truth,
+                f"run {number}",
+                rng,
+                seconds=15.0,
+                rate_hz=500.0,
+                noise_a=0.1,
+                payload=payload,
+                bend=lambda q: q * less,
+            )
+        )
+    fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)  # the gain of J1 is not seen
+    check = check_geometry(gather(fixed, runs), np.random.default_rng(0), GATES)
+    assert check.mistake is not None
+    named = {(one.effect.name, one.axis) for one in check.alike}
+    assert named == {("gravity-direction", 0), ("zero-offset", 1)}
+    for one in check.alike:
+        assert np.degrees(np.linalg.norm(one.coefficients)) == pytest.approx(2.0, abs=0.5)
+        assert np.degrees(np.max(one.deviations)) > 0.01  # a lost direction would have none
+    assert check.axes_to_move == (0,)
+
+
 def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
     """A wrong zero explains a part of what it leaves; the spring explains all of it."""
     truth = three_axes_truth()

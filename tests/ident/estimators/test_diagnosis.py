@@ -15,7 +15,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
-from ident.errors import CurrentReversed, CurrentUnsigned, ModelContradicted, PayloadDiffers, UnitsMistaken
+from ident.errors import GAIN_UNSEEN, CurrentReversed, CurrentUnsigned, ModelContradicted, PayloadDiffers, UnitsMistaken
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
     channel_errors,
@@ -289,6 +289,29 @@ def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: flo
     for one in found:
         assert limits_in(one.expected) == (0.7, 1.3)
         assert one.expected.endswith("within 3 σ")
+
+
+@pytest.mark.parametrize(
+    ("gain", "std", "is_named"),
+    [
+        (-204.0, 97.0, True),  # of a drive of 40 Nm/A
+        (2216.0, 1030.0, True),
+        (-63.0, 63.0, True),
+        (55.0, 59.0, True),
+        (36.0, 17.0, False),  # uncertain, and not absurd
+        (36.0, 5.0, False),
+        (-40.0, 4.0, False),  # a reversed current, which has its own name
+    ],
+)
+def test_a_gain_that_the_moves_hardly_show_is_named_where_its_number_is_absurd(
+    gain: float, std: float, is_named: bool
+) -> None:
+    estimate = an_estimate(np.array([gain]), np.array([std]))
+    found = [one for one in gain_diagnoses(estimate, np.array([38.0]), ("J1",)) if one.name == GAIN_UNSEEN]
+    assert bool(found) == is_named
+    for one in found:
+        assert one.axes == ("J1",)
+        assert "record" in one.remedy
 
 
 def test_the_papers_gains_are_not_off_their_nameplates() -> None:

@@ -21,7 +21,7 @@ from ident.estimators.turned_geometry import (
     with_gravity,
 )
 from tests.ident.mistaken import AXES, SMALL, small_recordings, with_currents
-from tests.ident.recordings import FloatArray, Truth, three_axes_truth
+from tests.ident.recordings import MOUNTED, FloatArray, Truth, record, three_axes_truth
 
 DOWN = np.array([0.0, 0.0, -9.81])
 
@@ -103,6 +103,60 @@ def test_a_zero_that_is_far_off_is_found_with_its_size(truth: Truth, clean: list
     assert f"add about {read:+.0f} deg to `zero_offset_deg` of J2" in said.remedy
     corrected = found.corrected_positions(np.zeros((1, 3)))
     assert corrected == pytest.approx(np.deg2rad([[0.0, read, 0.0]]))
+
+
+def test_find_turned_geometry_with_a_leaning_base_blames_no_zero(truth: Truth) -> None:
+    """A zero of J1 that is off by 116° turns a lean by 8° away from the arm; the lean itself explains all of it."""
+    easy = truth.parameters.copy()
+    easy[10:14] *= 0.05  # friction of J1 would hide the torque of the lean
+    runs = runs_with_less_of_j1(replace(truth, parameters=easy), share=0.6, noise_a=0.03)
+    leaning = with_gravity(truth.model, tilted_gravity(8.0, azimuth_deg=60.0))
+    assert found_in(replace(truth, model=leaning), runs) is None
+
+
+def test_find_turned_geometry_where_j1_hardly_moves_names_gravity_and_the_zero_that_explains_the_same(
+    truth: Truth,
+) -> None:
+    runs = runs_with_less_of_j1(truth, share=0.1, noise_a=0.1)
+    leaning = with_gravity(truth.model, tilted_gravity(14.0, azimuth_deg=180.0))
+    found = found_in(replace(truth, model=leaning), runs)
+    assert found is not None
+    assert found.gravity is not None
+    assert [reading.axis for reading in found.readings] == [1]
+    said = found.diagnosis(AXES)
+    assert "explained as well by the zero of J2 off by" in said.found
+    assert "these moves do not tell them apart" in said.remedy
+    assert "gravity_m_s2" not in said.remedy
+
+
+def runs_with_less_of_j1(truth: Truth, share: float, noise_a: float) -> list[Run]:
+    """Runs in which J1 moves through a share of its range only."""
+    rng = np.random.default_rng(0)
+    less = np.array([share, 1.0, 1.0])
+    runs = list[Run]()
+    for index in range(4):
+        payload = MOUNTED if index % 2 else None
+        runs.append(
+            record(
+                truth,
+                f"r{index}",
+                rng,
+                payload,
+                seconds=16.0,
+                noise_a=noise_a,
+                rate_hz=200.0,
+                bend=lambda q: q * less,
+            )
+        )
+    return runs
+
+
+def tilted_gravity(angle_deg: float, azimuth_deg: float) -> FloatArray:
+    """Gravity that leans by an angle towards an azimuth [m/s²], shape (3,)."""
+    angle = np.deg2rad(angle_deg)
+    azimuth = np.deg2rad(azimuth_deg)
+    sideways = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return np.asarray(9.81 * (np.sin(angle) * sideways - np.cos(angle) * np.array([0.0, 0.0, 1.0])))
 
 
 @pytest.mark.parametrize("axis", [0, 2])

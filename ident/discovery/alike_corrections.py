@@ -1,0 +1,96 @@
+"""Corrections of the description that recordings do not tell apart, and which axes must move further for it.
+
+A zero that is off turns gravity for the arm behind its joint. Where the joints before it hardly move, a base that leans
+makes the same torques. Then neither is known, although each alone has a small σ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.data.dataset import Dataset
+from ident.discovery.candidates import SearchProblem
+from ident.discovery.search import Finding
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset
+from ident.model.robot import JointKind, Robot
+
+OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside another effect
+WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behind it enough
+
+
+def explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:
+    """Whether a correction explains most of what it does beside another effect, too.
+
+    Args:
+        problem: with rows that serve as signals.
+        correction: of the description.
+        rival: the other effect.
+    """
+    of_rival = problem.torque_at_rows(rival.effect, rival.axis)
+    of_correction = problem.torque_at_rows(correction.effect, correction.axis)
+    alone, both = problem.trials([of_rival, np.concatenate((of_rival, of_correction), axis=1)])
+    if alone is None or both is None:
+        return False
+    fall = float(alone.held_out.sum() - both.held_out.sum())
+    return fall >= OWN_SHARE * correction.held_out_fall
+
+
+def alike_corrections(problem: SearchProblem, correction: Finding, findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Corrections that folds do not distinguish from one that was found, and beside which it explains little more.
+
+    Args:
+        problem: with rows that serve as signals.
+        correction: that was found.
+        findings: of all corrections of the description.
+    """
+    alike: list[Finding] = []
+    for other in findings:
+        if PlacedEffect(other.effect, other.axis) not in correction.ambiguity or other.impossible:
+            continue
+        if not explains_beside(problem, correction, other):
+            alike.append(other)
+    return tuple(alike)
+
+
+def axes_to_move(alike: Sequence[PlacedEffect], robot: Robot, datasets: Sequence[Dataset]) -> tuple[int, ...]:
+    """Axes that must turn further for recordings to tell corrections apart; empty where no motion of one axis does.
+
+    A zero differs from a turn of gravity by the joints before it, and from another zero by their own joints.
+
+    Args:
+        alike: corrections that the recordings do not tell apart.
+        robot: a serial robot, or a tree.
+        datasets: the recordings.
+    """
+    zeros = {placed.axis for placed in alike if isinstance(placed.effect, ZeroOffset)}
+    if not zeros or any(isinstance(placed.effect, LatePosition) for placed in alike):
+        return ()
+    wanted = zeros
+    if any(isinstance(placed.effect, GravityDirection) for placed in alike):
+        wanted = set().union(*(axes_before(axis, robot) for axis in zeros))
+    turning = [axis for axis in sorted(wanted) if robot.axes[axis].kind is JointKind.REVOLUTE]
+    ranges_rad = _ranges(datasets)
+    narrow = [axis for axis in turning if ranges_rad[axis] < WIDE_RAD]
+    return tuple(narrow or turning)
+
+
+def axes_before(axis: int, robot: Robot) -> tuple[int, ...]:
+    """Axes whose joints are before that of an axis on its chain, the last one first."""
+    before: list[int] = []
+    joint = robot.joints[robot.axis_joints[axis]].parent
+    while joint >= 0:
+        if joint in robot.axis_joints:
+            before.append(robot.axis_joints.index(joint))
+        joint = robot.joints[joint].parent
+    return tuple(before)
+
+
+def _ranges(datasets: Sequence[Dataset]) -> FloatArray:
+    """Range of each axis in all recordings together [rad or m], shape (m,)."""
+    highest = np.max([data.position_rad.max(axis=0) for data in datasets], axis=0)
+    lowest = np.min([data.position_rad.min(axis=0) for data in datasets], axis=0)
+    return np.asarray(highest - lowest)
