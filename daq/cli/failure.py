@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from daq.report.document import ErrorReport
 
 WITH_EVIDENCE = (
-    identification.ModelContradicted | identification.PayloadMissing | identification.CurrentUnsigned
+    identification.ModelContradicted
+    | identification.PayloadMissing
+    | identification.CurrentUnsigned
+    | identification.ChannelUnfit
 )  #: Errors of the identification that have found, expected and remedy
 NOTES = ("kept", "hint")
 """Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""

@@ -6,14 +6,25 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
+from ident.data.run_channels import RunChannels, missing_joint, still_joint
 from ident.equations.system import System
 from ident.equations.triangles import solve
-from ident.errors import CurrentReversed, ModelContradicted, PayloadUnseen, RolesExchanged, UnitsMistaken
+from ident.errors import (
+    CurrentReversed,
+    ModelContradicted,
+    NotConverged,
+    PayloadDiffers,
+    PayloadUnseen,
+    RankDeficient,
+    RolesExchanged,
+    UnitsMistaken,
+)
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import wls
 from ident.model.model import Model
@@ -63,6 +74,36 @@ def refuse_mistakes(
     if nameplate is not None and not estimate.gains_fixed:
         require_roles(estimate.gains, nameplate)
         require_units(estimate.gains, nameplate)
+
+
+# Causes in single channels
+
+
+@contextmanager
+def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[None]:
+    """Name a joint that never moves where a fit is refused for what that leaves.
+
+    Args:
+        runs: of the fit.
+        axes: name of each axis.
+
+    Raises:
+        JointStill: in place of the error that it explains.
+    """
+    try:
+        yield
+    except RankDeficient as error:
+        still = missing_joint(runs, axes)
+        if still is None:
+            raise
+        raise still from error
+    except (ModelContradicted, NotConverged, PayloadUnseen) as error:
+        # The other contradictions have a cause of their own: signs, units or roles.
+        is_unexplained = type(error) in {ModelContradicted, NotConverged, PayloadDiffers, PayloadUnseen}
+        still = still_joint(runs, axes, "a fit that contradicts itself") if is_unexplained else None
+        if still is None:
+            raise
+        raise still from error
 
 
 # The payload and the roles of the runs
