@@ -152,6 +152,10 @@ class PayloadDiffers(ModelContradicted):
     """A run carries another payload than it says."""
 
 
+class MassesContradict(ModelContradicted):
+    """The torques deny the masses of several payloads together."""
+
+
 class TooFewMoves(IdentificationError):
     """Uncertainty and left-out moves need more of them."""
 
@@ -216,8 +220,8 @@ class Diagnosis:
 
     #: One of axis-error, axis-idle, channels-exchanged, current-clipped, current-off-scale, current-reversed,
     #: estimators-disagree, gain-off-nameplate, geometry-off, gravity-tilted, gravity-turned, ill-conditioned,
-    #: joint-still, length-off, masses-disagree, payload-differs,
-    #: position-late, position-reversed, torque-above-limit, zero-off, zero-turned.
+    #: joint-still, length-off, masses-contradict, payload-differs, position-late,
+    #: position-reversed, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

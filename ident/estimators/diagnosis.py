@@ -87,7 +87,7 @@ def diagnose(
         return tuple(_diagnoses(found, axes, nameplate, effort_limit))
 
 
-TRACES_OF_STILL_JOINTS = {"axis-error", "payload-differs"}
+TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}
 """Diagnoses that an encoder may leave which stood still while its joint moved. One of a joint at rest leaves none."""
 
 

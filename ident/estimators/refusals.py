@@ -17,6 +17,7 @@ from ident.equations.system import System
 from ident.equations.triangles import solve
 from ident.errors import (
     CurrentReversed,
+    MassesContradict,
     ModelContradicted,
     NotConverged,
     PayloadDiffers,
@@ -27,6 +28,7 @@ from ident.errors import (
 )
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import wls
+from ident.estimators.payload_diagnosis import likeliest_masses, payload_differences
 from ident.model.model import Model
 from ident.plausible import GAIN_RANGE, LARGEST_GAIN_STD, UNIT_RATIO, range_text
 
@@ -118,12 +120,27 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
 
     Raises:
         PayloadUnseen: every gain is uncertain by more than LARGEST_GAIN_STD, or the weight is below LEAST_WEIGHT.
+        MassesContradict: the first, because the masses of several payloads contradict each other.
     """
     relative, rows = estimate.gains_std / np.abs(estimate.gains), system.joints.factors
     torque = [LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains) for factor in rows]
     weightless = all(np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True))
     if weightless or not float(np.min(relative)) <= LARGEST_GAIN_STD:
+        require_agreeing_masses(system, estimate)
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
+
+
+def require_agreeing_masses(system: System, estimate: Estimate) -> None:
+    """Refuse masses of several payloads that contradict each other.
+
+    Raises:
+        MassesContradict: they do, and that explains more than another payload in a single run.
+    """
+    found = payload_differences(system, estimate.gains, estimate.parameters, 0)
+    masses = likeliest_masses(system, estimate.gains, estimate.parameters, found)
+    if masses is not None:
+        one = masses.diagnosis
+        raise MassesContradict("the payloads", found=one.found, expected=one.expected, remedy=one.remedy)
 
 
 def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
