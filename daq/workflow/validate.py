@@ -19,7 +19,7 @@ from daq.config.cell import Cell, model_of
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.diagnoses import drift_diagnosis, with_verbs
+from daq.workflow.diagnoses import CORRECTED_BY, drift_diagnosis, with_verbs
 from daq.workflow.geometry_diagnoses import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import AcceptedEffect, Calibration
@@ -406,7 +406,7 @@ def cross_validate(
         except IdentificationError as error:
             rows = str(error)
         weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(of_cell_now, rows, kg)))
-    stored = not_repeated(calibrations[first].diagnoses, diagnoses)
+    stored = not_repeated(not_corrected_since(calibrations[first], described), diagnoses)
     return CrossValidation(
         axes=tuple(gain.axis for gain in calibrations[first].gains),
         calibrations=dict(calibrations),
@@ -622,6 +622,28 @@ def _remaining(accepted: AcceptedEffect, calibration: Calibration, cell: Cell) -
     by_name = dict(zip((column.name for column in placed.columns), left, strict=True))
     coefficients = tuple(replace(one, value=float(by_name[one.name])) for one in accepted.coefficients)
     return replace(accepted, coefficients=coefficients)
+
+
+SAME_SIGMAS = 3.0  #: Of a correction: what is left of it after the cell file was corrected is its own noise
+
+
+def not_corrected_since(calibration: Calibration, cell: Cell) -> tuple[Diagnosis, ...]:
+    """Diagnoses of a calibration, less those of numbers that the cell file has right since.
+
+    Args:
+        calibration: of the cell, at any date.
+        cell: as it is described now.
+    """
+    corrected: set[tuple[str, str | None]] = set()
+    for accepted in calibration.effects:
+        placed, _ = placed_effect(accepted, calibration)
+        if accepted.described is None or _described(placed, cell) in {None, accepted.described}:
+            continue
+        left = _remaining(accepted, calibration, cell)
+        if all(abs(one.value) <= SAME_SIGMAS * one.std for one in left.coefficients):
+            axis = accepted.axis if placed.effect.has_axis else None
+            corrected.add((CORRECTED_BY[type(placed.effect)], axis))
+    return tuple(one for one in calibration.diagnoses if (one.name, next(iter(one.axes), None)) not in corrected)
 
 
 def _described(placed: PlacedEffect, cell: Cell) -> tuple[float, ...] | None:
