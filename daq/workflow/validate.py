@@ -26,6 +26,7 @@ from ident.calibration import AcceptedEffect, Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.data.run_channels import channels_of, clip_diagnoses, require_live_currents, still_diagnoses
 from ident.effects.dictionary import GEOMETRY as CORRECTION_FAMILIES
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import TemperatureFriction
@@ -505,6 +506,9 @@ def diagnose_run(
         run: as it was read.
         standard: equations of this run alone, in standard parameters (`reduce_runs`).
         conditioning: the filters.
+
+    Raises:
+        CurrentConstant: a motor moves, and its current has one value.
     """
     if any(one.name in GEOMETRY for one in calibration.diagnoses):
         return ()  # it predicts in a wrong geometry
@@ -521,12 +525,16 @@ def diagnose_run(
     left = _rms(left_nm, use)
     idle = idle_joints(model, size, left)
     used = use & ~idle[:, None]
+    channels = (channels_of(model, data),)
+    require_live_currents(channels[0], axes)
+    of_channels = (*still_diagnoses(channels, axes), *clip_diagnoses(channels, axes))
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
         found += _payload_diagnoses(calibration, run.payload, standard)
     errors = list(map(with_verbs, axis_error_diagnoses(size, left, idle, axes, runs)))
-    if not errors and not any(one.name == "current-reversed" for one in found):
-        return tuple(found)
+    is_right = not errors and not any(one.name == "current-reversed" for one in found)
+    if is_right or of_channels:  # a fault of a channel is the cause of the others
+        return (*of_channels, *(found or errors))
     turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), _gains(calibration))
     if turned is not None:
         return (turned.diagnosis(axes, runs),)
