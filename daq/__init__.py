@@ -1,4 +1,4 @@
-"""Calibrate the drive gains of a robot cell: from recorded logs to the numbers in the controller.
+"""Calibrate the drive gains of a robot cell: from recorded logs to the current gains of its controller.
 
 Everything that a program needs is here; importing `daq` loads no module before a name is used::
 
@@ -35,41 +35,54 @@ from typing import TYPE_CHECKING
 
 from lazy_names import lazy_names
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the names of a module stand together
+    # ruff: noqa: I001
     from daq.config.cell import Cell as Cell
     from daq.config.cell_file import load_cell as load_cell
     from daq.config.controller import ControllerFormat as ControllerFormat
-    from daq.documents.calibration_file import load_calibration as load_calibration
-    from daq.documents.calibration_file import save_calibration as save_calibration
-    from daq.errors import CalibrationRefused as CalibrationRefused
-    from daq.errors import ConfigurationError as ConfigurationError
-    from daq.errors import ControllerChanged as ControllerChanged
-    from daq.errors import ControllerUnfit as ControllerUnfit
-    from daq.errors import DaqError as DaqError
-    from daq.errors import DataError as DataError
-    from daq.errors import ExitCode as ExitCode
-    from daq.errors import LogUnreadable as LogUnreadable
-    from daq.errors import OutputFailed as OutputFailed
-    from daq.errors import UsageError as UsageError
+    from daq.documents.calibration_file import (
+        load_calibration as load_calibration,
+        save_calibration as save_calibration,
+    )
+    from daq.errors import (
+        CalibrationRefused as CalibrationRefused,
+        ConfigurationError as ConfigurationError,
+        ControllerChanged as ControllerChanged,
+        ControllerUnfit as ControllerUnfit,
+        DaqError as DaqError,
+        DataError as DataError,
+        ExitCode as ExitCode,
+        LogUnreadable as LogUnreadable,
+        OutputFailed as OutputFailed,
+        UsageError as UsageError,
+    )
     from daq.log.conversion import load_run as load_run
-    from daq.log.reader import Log as Log
-    from daq.log.reader import LossyLogs as LossyLogs
-    from daq.log.reader import read_log as read_log
-    from daq.workflow.fit import Fit as Fit
-    from daq.workflow.fit import calibration_of as calibration_of
-    from daq.workflow.fit import close_loop as close_loop
-    from daq.workflow.fit import fit as fit
-    from daq.workflow.fit import fit_logs as fit_logs
-    from daq.workflow.validate import Validation as Validation
-    from daq.workflow.validate import validate as validate
+    from daq.log.reader import (
+        Log as Log,
+        LossyLogs as LossyLogs,
+        read_log as read_log,
+    )
+    from daq.workflow.fit import (
+        Fit as Fit,
+        calibration_of as calibration_of,
+        close_loop as close_loop,
+        fit as fit,
+        fit_logs as fit_logs,
+    )
+    from daq.workflow.validate import (
+        Validation as Validation,
+        validate as validate,
+    )
     from daq.writeback.drive_target import DriveTarget as DriveTarget
     from daq.writeback.file_target import FileTarget as FileTarget
     from daq.writeback.request import Request as Request
-    from daq.writeback.target import Proposal as Proposal
-    from daq.writeback.target import Written as Written
-    from daq.writeback.target import apply as apply
-    from daq.writeback.target import propose as propose
-    from daq.writeback.target import rollback as rollback
+    from daq.writeback.target import (
+        Proposal as Proposal,
+        Written as Written,
+        apply as apply,
+        propose as propose,
+        rollback as rollback,
+    )
     from ident.calibration import Calibration as Calibration
 
     __all__: list[str]

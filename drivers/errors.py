@@ -11,7 +11,7 @@ DriverError
 │   ├── StateRefused          an NMT or CiA 402 state was not reached
 │   ├── ParameterRefused      a parameter was not written, not saved, or reads back differently
 │   └── DriveFault            EMCY, fault bit, lost heartbeat, limit, stale or malformed data while running
-├── ParametersMixed           a write failed midway, and not every drive has its old value again
+├── ParametersMixed           a write failed midway, and not every drive has its previous value again
 ├── SampleLost                a SYNC cycle had no complete answer
 ├── MotionRefused             motion without permission, or outside the limits
 └── MotionTimeout             a move did not end in time
@@ -207,12 +207,13 @@ class ParameterRefused(NodeError):
 
 
 class ParametersMixed(DriverError):
-    """A write failed midway, and not every drive has its old value again."""
+    """A write failed midway, and not every drive has its previous value again."""
 
     def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
         super().__init__(
-            f"the write failed midway; the old values are restored in {', '.join(restored) or 'no drive'}, and NOT "
-            f"confirmed where {'; '.join(problems)}; do not enable an axis before every drive has its old value again"
+            f"the write failed midway; the previous values are restored in {', '.join(restored) or 'no drive'}, and "
+            f"NOT confirmed where {'; '.join(problems)}; do not enable an axis before every drive has its previous "
+            "value again"
         )
         self.restored = restored
         self.problems = problems

@@ -30,7 +30,7 @@ def main() -> daq.Calibration:
     if calibration.holdout_error_percent is not None:
         print(f"error on the held-out runs: {calibration.holdout_error_percent.total:.1f} %")
 
-    # The file is written whole and read back; `daq.propose` shows what it would change in the controller.
+    # The file is written whole and read back; `daq.propose` shows how it would change the current gains.
     daq.save_calibration(calibration, arguments.out)
     return calibration
 

@@ -70,8 +70,8 @@ class AcceptedEffect:
     settings: dict[str, float]  #: the searched (non-linear) parameters by name, units in the names
     coefficients: tuple[Parameter, ...]  #: the linear parameters, identified
     #: Error without the effect on data that the fit did not use [%]: of the axis's joint torque on held-out runs (in
-    #: total for an effect on all motors, or on a joint without one); without such runs, of the most affected motor's
-    #: current on left-out moves.
+    #: total for an effect on all motors, for a correction of the description, or on a joint without a motor); without
+    #: such runs, of the most affected motor's current on left-out moves.
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
@@ -338,6 +338,9 @@ def _accepted(
     places: Sequence[str],
     found: Sequence[Parameter],
 ) -> AcceptedEffect:
+    # Who reads a calibration needs no effects.
+    from ident.effects.geometry_corrections import is_correction  # noqa: PLC0415
+
     # The last turn that added it: an effect may have been dropped and added again.
     for number, step in reversed(list(enumerate(steps))):
         before = steps[number - 1].after if number else None
@@ -351,7 +354,16 @@ def _accepted(
     verdict = next((one for one in steps[-1].verdicts if one.placed == placed), None)
     if verdict is not None:
         held_out = verdict.before, verdict.after
-    errors = [math.nan if e is None else e.at(placed.axis) if axis in places else e.total for e in held_out]
+    # A correction of the description is judged by all motors together, and so shown by them.
+    has_own_error = axis in places and not is_correction(placed)
+    errors: list[float] = []
+    for error in held_out:
+        if error is None:
+            errors.append(math.nan)
+        elif has_own_error:
+            errors.append(error.at(placed.axis))
+        else:
+            errors.append(error.total)
     if not all(map(math.isfinite, errors)):
         # Without a run that was held out, the moves that were left out in turn must do.
         errors = [finding.error_before_percent, finding.error_after_percent]

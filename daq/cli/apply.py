@@ -69,7 +69,7 @@ class ApplyOptions:
     ] = None
     max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None
     max_nameplate_percent: Annotated[
-        float | None, typer.Option(help="Tighter bound on the distance from the nameplate [%].", min=0.0)
+        float | None, typer.Option(help="Tighter bound on the change from the nameplate [%].", min=0.0)
     ] = None
     max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None
     configuration_changed: Annotated[
@@ -193,15 +193,15 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
     if proposal.refusals:
         # The review of a changed base is all that is missing, and this dry run is that review.
         if not yes and {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
-            console.print("Nothing was written. If this change of the present content is right, repeat with:")
+            console.print("Nothing was written. If this change of the current gains is right, repeat the command with:")
             console.print(f"  --yes --base {edit.base}")
     elif written is not None and isinstance(target, DriveTarget):
-        console.print(f"Written to the drives and read back; {written.backup} has the values before.", end=" ")
+        console.print(f"Written to the drives and read back; {written.backup} has the previous gains.", end=" ")
         console.print(_saving_text(target.saving))
         console.print(f"To undo: {undo}")
     elif written is not None:
         backup = "none" if written.backup is None else written.backup.name
-        console.print(terminal_text(f"Written to {edit.subject}, backup {backup}; the audit is {audit}."))
+        console.print(terminal_text(f"Written to {edit.subject}, backup {backup}; audit log {audit}."))
         console.print(terminal_text(f"To undo: {undo}"))
     elif not edit.has_effect:
         console.print("Nothing to write: the controller file has these gains already.")
@@ -314,13 +314,13 @@ def rollback_verb(
         console = output_console()
         show_file_rollback(written, console)
         if audit is None:
-            console.print("Not in an audit: neither a cell nor --audit was given.")
+            console.print("No audit log has this rollback: neither a cell nor --audit was given.")
 
 
 def rollback_drives(
     declared: Cell, *, now: datetime, actor: Applier, saving: Saving, audit: Path | None, yes: bool, json: bool
 ) -> None:
-    """Show the values in the drives before the last write, and restore them with `yes`; a second time undoes it."""
+    """Show the previous gains of the drives, and restore them with `yes`; a second time undoes it."""
     from daq.report.proposal import drive_rollback_report, show_drive_rollback
     from daq.writeback import target
     from daq.writeback.drive_target import record_folder
@@ -340,7 +340,7 @@ def rollback_drives(
         console.print("Dry run, nothing was written. To restore them, repeat the command with --yes.")
     else:
         backup = "" if written.backup is None else written.backup.name
-        console.print(f"Restored the values of {planned.source}; those before are now in {backup}.", end=" ")
+        console.print(f"Restored the gains of {planned.source}; the replaced gains are in {backup}.", end=" ")
         console.print(_saving_text(saving))
 
 

@@ -6,7 +6,7 @@ import os
 import sys
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from daq.config.recalibration import PlannedRun
     from daq.jobs.calibrate import CheckLine
     from daq.jobs.context import Tools
-    from daq.log.feed import Feed
+    from daq.jobs.journal import Journal
+    from daq.log.feed import Feed, QuickLook
     from daq.workflow.fit import Fit
     from daq.workflow.record import Recorded, RecordingRequest
-    from daq.writeback.file_target import FileEdit
     from daq.writeback.target import Proposal
     from ident.calibration import Calibration
     from ident.discovery.before_after import Account
@@ -120,7 +120,7 @@ class Person:
         """Ask whether a block with a mistake is recorded again; `keep` keeps it."""
         return ask(f"Press Enter to record it again, or type {KEEP} to keep {run.name} as it is") != KEEP
 
-    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+    def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""
         from daq.report.proposal import show_proposal
 
@@ -205,7 +205,34 @@ def _show_check(lines: Sequence[CheckLine]) -> None:
         raise typer.Exit(ExitCode.CONFIGURATION)
 
 
-def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
+@dataclass(slots=True)
+class Looks:
+    """Shows the gains after each move, while a block is recorded."""
+
+    feed: Feed  #: for consoles
+    journal: Journal  #: for the terminal
+    block: str = ""  #: that is being recorded; empty between two blocks
+    last: QuickLook | None = None  #: that was printed
+
+    def show(self, look: QuickLook) -> None:
+        """Publish a look, and print it if it is new; in the thread that receives it.
+
+        One that comes after the end of its block is not printed: the operator types then.
+        """
+        from daq.jobs.journal import Level
+        from daq.jobs.live_gains import tells_something_new
+
+        self.feed.look(look)
+        is_late = look.block not in ("", self.block)
+        if is_late or not tells_something_new(look, self.last):
+            return
+        self.last = look
+        # The present stream: while a progress bar is shown, it prints above the bar.
+        journal = replace(self.journal, stream=sys.stderr)
+        journal.say(Level.INFO, "quick estimate", **asdict(look))
+
+
+def _tools(cell_file: Path, cell: Cell, looks: Looks) -> Tools:
     """Return the tools of a session, which show a person what they do."""
     from daq.jobs.certificate import save_certificate
     from daq.jobs.context import Tools
@@ -215,15 +242,22 @@ def _tools(cell_file: Path, cell: Cell, feed: Feed) -> Tools:
     def save_report(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
         certificate = save_certificate(cell_file, cell, fitted, changed, calibration, folder)
         tell("")
-        tell(f"Verdict: {certificate.verdict.value}. {certificate.sentence}", bold=True)
+        tell(f"Verdict: {certificate.sentence}", bold=True)
         open_page(folder / PAGE)
 
     def record_with_bar(request: RecordingRequest, **further: Any) -> Recorded:
         # A bar of its own: between two blocks the operator types, and a bar would take the line.
         with progress_bar(f"recording {request.out.stem}") as report_progress:
-            return record(
-                request, feed=feed, progress=lambda done, total: report_progress(done, total, "moves"), **further
-            )
+            looks.block = request.out.stem
+            try:
+                return record(
+                    request,
+                    feed=looks.feed,
+                    progress=lambda done, total: report_progress(done, total, "moves"),
+                    **further,
+                )
+            finally:
+                looks.block = ""
 
     return Tools(save_report=save_report, record=record_with_bar)
 
@@ -238,6 +272,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
     from daq.jobs.calibrate import calibrate, check_readiness, context_of, payload_for_blocks
     from daq.jobs.guided import GuidedSettings
     from daq.jobs.journal import Form
+    from daq.jobs.live_gains import LiveGains
     from daq.jobs.position import sessions_folder
     from daq.jobs.reporting import ending, session_report
     from daq.jobs.story import Story
@@ -261,14 +296,16 @@ def calibrate_verb(options: CalibrateOptions) -> None:
 
     try:
         with interruptible() as block_signals, Feed(options.cell) as feed:
-            tools = _tools(options.cell, declared, feed)
+            looks = Looks(feed, journal)
+            tools = _tools(options.cell, declared, looks)
             if options.check:
                 context = context_of(options.cell, declared, settings, person, tools, journal)
                 _show_check(check_readiness(context, options.payload, options.block))
                 return
             if not options.enable_motion:
                 raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
-            ended = calibrate(options.cell, declared, settings, person, tools, journal, block_signals=block_signals)
+            with LiveGains(options.cell, payload_name, settings.target_percent, looks.show):
+                ended = calibrate(options.cell, declared, settings, person, tools, journal, block_signals=block_signals)
     except KeyboardInterrupt as interrupt:
         axes = "; ".join(stop_notes(interrupt)) or "axes stopped"
         say_last(f"interrupted: {axes}; the same command goes on where the session is")

@@ -42,9 +42,8 @@ def certificate_verb(
 
     from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
     from daq.jobs.session import session_of
-    from daq.report.certificate import Origin, certificate_report, certify
+    from daq.report.certificate import Origin, certificate_report, certify, status_text
     from daq.report.certificate_page import certificate_page
-    from daq.report.certificate_status import status_text
     from daq.report.comparison import compare, without_controller
     from daq.report.html import MARK
     from daq.report.text import terminal_text

@@ -75,7 +75,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     ),
     driver.NodeError: ("an amplifier as the cell file describes it", "compare it with `drivegain scan CELL`"),
     driver.ParametersMixed: (
-        "all drives with their old values, or all with the new ones",
+        "all drives with their previous values, or all with the new ones",
         "`drivegain rollback CELL --drives` before an axis is enabled",
     ),
     driver.SampleLost: (

@@ -59,7 +59,7 @@ class LogsRequest:
     """Logs to fit and places for the result, as the command line asks for them."""
 
     logs: Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
-    gains: Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")] = Gains.FREE
+    gains: Annotated[Gains, typer.Option(help="fixed: hold the gains at the nameplate (classical IDIM).")] = Gains.FREE
     holdout: Annotated[
         list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
     ] = None

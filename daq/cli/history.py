@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -23,6 +22,7 @@ from daq.errors import (
     UsageError,
     evidence,
 )
+from daq.files import sha256
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ def history_verb(
     csv: Annotated[Path | None, output_option("--csv", "Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
-        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
+        str | None,
+        typer.Option("--acknowledge", metavar="AXIS", help="The change of an axis is explained: begin a new baseline."),
     ] = None,
     by: Annotated[str | None, typer.Option("--by", help="With --acknowledge: who explains it; you by default.")] = None,
     why: Annotated[str | None, typer.Option("--why", help="With --acknowledge: what happened.")] = None,
@@ -62,7 +63,7 @@ def history_verb(
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
 
     An alarm means that a gain has changed by more than noise: a drift that adds up (CUSUM), a steady trend, or one
-    calibration far off. What it may come from is asked, not claimed. docs/evidence/drift.md says how often an alarm is
+    calibration far off. Possible causes are printed as questions. docs/evidence/drift.md says how often an alarm is
     false.
     """
     from daq.ledger.ledger import MAY_LACK, Ledger
@@ -244,7 +245,7 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
     before = verify_ledger(ledger).unknown
-    new = enter_calibration(ledger, calibration, digest=hashlib.sha256(content).hexdigest(), who=who, at=now)
+    new = enter_calibration(ledger, calibration, digest=sha256(content), who=who, at=now)
     say(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
     checked = verify_ledger(ledger, _session_heads(ledger.cell))

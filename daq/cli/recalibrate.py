@@ -17,7 +17,7 @@ from daq.advice import for_command_line
 from daq.cli.terminal import interruptible, say
 from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.environment import login
-from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code, writing
+from daq.errors import DaqError, ExitCode, UsageError, exit_code, writing
 from daq.files import replace_file
 from daq.report.text import printable
 from drivers.errors import DriverError, all_notes, stop_notes
@@ -25,9 +25,6 @@ from ident.errors import IdentificationError
 
 if TYPE_CHECKING:
     from daq.jobs.journal import Journal
-    from daq.workflow.fit import Fit
-    from ident.calibration import Calibration
-    from ident.discovery.before_after import Account
 
 
 def recalibrate_verb(
@@ -68,11 +65,9 @@ def recalibrate_verb(
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
 
-    from daq.documents.session_state import Outcome
     from daq.jobs.certificate import save_certificate
     from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
-    from daq.jobs.journal import Level
     from daq.jobs.reporting import conclusion_report, text
     from daq.log.feed import Feed
     from daq.report.job_schemas import DryRunReport
@@ -83,13 +78,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
-        fits: list[tuple[Fit, Account, Calibration, Path]] = []
-
-        def certify(fitted: Fit, changed: Account, calibration: Calibration, folder: Path) -> None:
-            save_certificate(cell, declared, fitted, changed, calibration, folder)
-            fits.append((fitted, changed, calibration, folder))
-
-        tools = Tools(save_report=certify, record=partial(record, feed=feed))
+        tools = Tools(save_report=partial(save_certificate, cell, declared), record=partial(record, feed=feed))
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:
@@ -98,12 +87,6 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
                 say("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
         ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
-        if ended.outcome is Outcome.APPLIED and fits:
-            # Once more: the first certificate was made before the gains were written.
-            try:
-                certify(*fits[-1])
-            except OutputFailed as error:
-                journal.say(Level.WARNING, "the certificate does not say that the gains are written", text=str(error))
     if json:
         print_json(conclusion_report(ended, cell))
     else:
@@ -132,12 +115,13 @@ def schedule_verb(
     The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
     name of this verb, `install-units`, goes on working.
     """
-    from daq.jobs.context import section_of, target_of
+    from daq.jobs.context import section_of
+    from daq.jobs.gain_target import file_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
     declared = read_cell(cell)
     section = section_of(declared)
-    target_of(declared)  # refuses a cell without a controller file
+    file_of(declared)  # refuses a cell without a controller file
     place = cell.resolve()
     try:
         owner = place.owner()

@@ -36,7 +36,7 @@ def scan_verb(
     """List the nodes on the cell's buses with identity, name and state, and compare them with the cell file.
 
     Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate gains are compared
-    with the motors' data in the drives and with the controller's file. Nothing is changed without
+    with the motors' data in the drives and with the current gains. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it. While a recording or
     another master uses the bus, nothing is sent: exit code 12 or 5.
     Exit code 5 also where an axis does not answer; what else is wrong is in the table, as another

@@ -250,7 +250,8 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     yield ""
     yield from map(Sentence, summary(fitted, outcome.changed, outcome.calibration.effects))
     yield ""
-    yield gain_table(outcome.calibration.gains, truth, title="Drive gains beside the truth of the simulated cell")
+    title = "Drive gains beside the truth of the simulated cell; change % is from the nameplate"
+    yield gain_table(outcome.calibration.gains, truth, title=title)
     if fitted.paper is not None:
         errors = (100.0 * (gain / truth[axis] - 1.0) for axis, gain in zip(truth, fitted.paper.gains, strict=True))
         yield "Errors of the paper's total least squares on the same rows: " + ", ".join(f"{e:+.2f} %" for e in errors)

@@ -124,7 +124,7 @@ class CellAxis:
     counts_per_revolution: int | None  #: encoder counts of a motor revolution; None where the import defines its own
     unit: JointUnit  #: unit of the joint's positions for people
     zero_offset_rad: float  #: position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint]
-    nameplate_gain: float  #: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed
+    nameplate_gain: float  #: drive gain of the data sheet, g = N·Gt·Kt [gain_unit], signed
     gain_unit: str  #: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference
     limits: Limits
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from math import radians
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -15,16 +17,16 @@ from daq.config.cell_closures import ClosedChain, chain_of, platform_frame
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.drive import drive_from_text
-from daq.config.hold import held_urdf
 from daq.config.workspace import clearance_of
-from daq.config.yaml_file import parse_yaml, read_model, read_yaml_bytes
+from daq.config.yaml_file import Document, Fault, fault_texts, parse_yaml, read_model, read_yaml_bytes
 from daq.environment import shipped_configurations
-from daq.errors import ConfigurationMissing
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing
 from drivers.profiles.profile import DriveProfile, Identity, TapPoint
 from ident.data.conditioning import Conditioning
+from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.robot import Place
-from ident.model.urdf import read_urdf
+from ident.model.urdf import hold_joints, read_urdf
 
 CELL = "cell.yaml"
 URDF = "robot.urdf"
@@ -106,6 +108,53 @@ def cell_from_bundle(
         history=None if file is None else model.history.place(file, controller),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
     )
+
+
+def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
+    """Return the URDF with the joints of `hold` fixed at their positions, the text itself without `hold`.
+
+    These are joints that are no axes of the cell, such as a gripper's or a mobile base's.
+
+    Raises:
+        ConfigurationInconsistent: a held joint does not exist, is an axis too, mimics a joint that moves,
+            or is held where it cannot be.
+    """
+    if not model.hold:
+        return urdf
+    try:
+        joints = {joint.get("name", ""): joint for joint in ElementTree.fromstring(urdf).findall("{*}joint")}
+        prismatic = {name for name, joint in joints.items() if joint.get("type") == "prismatic"}
+        held = {name: at if name in prismatic else radians(at) for name, at in model.hold.items()}
+        fixed = hold_joints(urdf, held)
+        faults = [*_hold_faults(model, held, joints)]
+    except ElementTree.ParseError:
+        return urdf  # the check of the robot says so
+    except ModelError as error:
+        found, _, expected = str(error).partition("; expected ")
+        faults = [Fault(("hold",), found, expected or "joints of the URDF that are no axes, each with its position")]
+    if faults:
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the cell file")
+    return fixed
+
+
+def _hold_faults(model: CellModel, held: dict[str, float], joints: dict[str, ElementTree.Element]) -> Iterator[Fault]:
+    """Find held joints that are axes, and positions that the URDF excludes."""
+    for name, position in held.items():
+        if name in model.axis_names:
+            yield Fault(("hold", name), "a joint that is also one of `axes`", "an axis or a held joint, not both")
+        limit = joints[name].find("{*}limit")
+        kind = joints[name].get("type")
+        if limit is None or kind == "continuous":
+            continue
+        try:
+            lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+        except ValueError:
+            continue  # a held joint's limits are needed for this check alone
+        margin = 0.01 * (upper - lower)
+        if lower < upper and not lower - margin <= position <= upper + margin:
+            unit, spelled = (1.0, "m") if kind == "prismatic" else (radians(1.0), "deg")
+            expected = f"{lower / unit:.4g} to {upper / unit:.4g} {spelled}, the limits in the URDF"
+            yield Fault(("hold", name), f"{model.hold[name]:g} {spelled}", expected)
 
 
 def digest(files: Mapping[str, bytes]) -> str:

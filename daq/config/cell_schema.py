@@ -16,7 +16,6 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
 from daq.config.cell_closures import ChainModel, ClosureModel
 from daq.config.controller import Controller
-from daq.config.document_kind import DocumentKind
 from daq.config.policy import (
     DEFAULT_APPLY_POLICY,
     DEFAULT_TARGET_SIGMA_PERCENT,
@@ -26,7 +25,7 @@ from daq.config.policy import (
 )
 from daq.config.recalibration import RecalibrationSection
 from daq.config.workspace import ClearanceSection, WorkspaceSection
-from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
+from daq.config.yaml_file import DocumentKind, FileName, Name, Positive, StrictModel, not_in_file
 from ident.arrays import FloatArray
 from ident.plausible import LEAD_MM, SPEED, within
 

@@ -15,15 +15,14 @@ from daq.config.cell_buses import bus_faults, producer_faults
 from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.controller import controller_faults
-from daq.config.hold import mimic_faults
-from daq.config.policy import max_change_faults
-from daq.config.signers import signer_faults
+from daq.config.policy import max_change_faults, signer_faults
 from daq.config.workspace import clearance_faults
 from daq.config.yaml_file import Document, Fault, Location, fault_texts
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
+from ident.model.urdf import LINKAGE, Mimic, mimics_of
 from ident.plausible import (
     ACCELERATION,
     FARTHEST_CENTRE_M,
@@ -135,6 +134,41 @@ def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
     if not urdf.strip():
         return [Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
     return [*mimic_faults(model.axis_names, urdf)] or [*chain_faults(model.robot, model.closures, urdf)]
+
+
+def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
+    """Find joints that mimic another one and still move: the equations give each joint a motion of its own.
+
+    Args:
+        axes: names of the axes.
+        urdf: text of the URDF, its held joints fixed; a joint that follows a held one is fixed with it.
+
+    Raises:
+        ModelError: the URDF cannot be read.
+    """
+    mimics = mimics_of(urdf)
+    for name, mimic in mimics.items():
+        found = f"joint {name} mimics {mimic.leader} (multiplier {mimic.multiplier:g})"
+        if mimic.at_rest:
+            expected = f"`hold` of {name} at its offset, {mimic.offset:g} rad or m: by that multiplier it never moves"
+            yield Fault(("robot", "urdf"), found, expected)
+            continue
+        first = _first_leader(name, mimics)
+        if first in axes:
+            yield Fault(("robot", "urdf"), found, LINKAGE)
+        else:
+            expected = f"`hold` of {first} if that is no axis, and {name} follows it; else {LINKAGE}"
+            yield Fault(("robot", "urdf"), found, expected)
+
+
+def _first_leader(name: str, mimics: Mapping[str, Mimic]) -> str:
+    """Return the joint at the head of a chain of followers; one of them where they follow each other in a circle."""
+    seen = {name}
+    leader = mimics[name].leader
+    while leader in mimics and leader not in seen:
+        seen.add(leader)
+        leader = mimics[leader].leader
+    return leader
 
 
 def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -383,7 +417,7 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         ((key, gain),) = axis.nameplate_gains.items()
         if not gain:
-            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
+            yield Fault(("axes", index, key), "0", "the nameplate gain of the data sheet, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]

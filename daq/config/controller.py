@@ -27,7 +27,7 @@ class ControllerFormat(Enum):
 
 @dataclass(frozen=True, slots=True)
 class GainKey:
-    """A key of a controller that keeps its gains in another unit, or with another sign."""
+    """Key of a current gain that is kept in another unit, or with another sign."""
 
     key: FileName
     factor: _Factor = 1.0  #: number in the file = gain × factor
@@ -66,7 +66,7 @@ class Controller:
 
     file: FileName | None = None  #: the controller file, relative to the cell file; None if only the drives are written
     format: ControllerFormat | None = None  #: format of the file; None to derive it from the suffix
-    gains: tuple[_Gain, ...] = ()  #: key of each axis's number in the file; empty without a file
+    gains: tuple[_Gain, ...] = ()  #: key of each axis's current gain in the file; empty without a file
     #: Objects of the drives, one for each axis; empty if the drives are not written.
     objects: tuple[GainObject, ...] = ()
 
@@ -80,7 +80,7 @@ class Controller:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Key of each gain in the file."""
+        """Key of each current gain in the file."""
         return tuple(gain.key if isinstance(gain, GainKey) else gain for gain in self.gains)
 
     @property

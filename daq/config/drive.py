@@ -13,8 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from daq.config.document_kind import DocumentKind
-from daq.config.yaml_file import Fault, Positive, StrictModel, fault_texts, parse_yaml, read_model
+from daq.config.yaml_file import DocumentKind, Fault, Positive, StrictModel, fault_texts, parse_yaml, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (

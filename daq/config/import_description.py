@@ -10,8 +10,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import (
+    DocumentKind,
     Fault,
     FileName,
     Name,
@@ -232,7 +232,7 @@ def load_import(path: Path) -> ImportDescription:
         if any(abs(one) < SMALLEST_FACTOR for one in factors):
             expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
-        # One name may be a whole matrix or field (daq.log.formats.with_columns); then the import counts.
+        # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import counts.
         if len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
             found = f"{len(section.columns)} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))

@@ -117,13 +117,14 @@ class Live:
         self._file = cell_file
         self._tasks: set[asyncio.Task[None]] = set()
         self.result: dict[str, Any] | None = None
+        self.quick: dict[str, Any] | None = None  #: Quick estimate of the gains after the last move
         self._clear("waiting", None)
 
     def _clear(self, phase: str, run: RunFacts | None) -> None:
         self.epoch += 1
         self.phase, self.run, self.remark, self._unfit = phase, run, "", ""
         if phase != "watching":  # how the last recording ended stays on the page
-            self.result = self.end = None
+            self.result = self.end = self.quick = None
         self.points, self.rows, self.events = Ring(KEPT_POINTS), Ring(KEPT_POINTS), Ring(KEPT_EVENTS)
         self.samples = self.lost = self.missing = self.dropped = self.done = 0
         self._number: int | None = None
@@ -175,6 +176,8 @@ class Live:
         self.events.add([self._shown(event) for event in message.events])
         if message.bus_load is not None:
             self._measured = message.bus_load
+        if message.quick is not None:
+            self.quick = asdict(message.quick)
         if message.result is not None:
             self.result = asdict(message.result)
         if message.end is not None:
@@ -242,6 +245,7 @@ class Live:
             "alarm": self._alarm(),
             "old": bool(self._silent_s) or bool(self.failed),
             **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
+            "quick": self.quick,
         }
 
     def _alarm(self) -> str:

@@ -1,6 +1,7 @@
 // The console's page: what the server sends is kept for two minutes, drawn on canvases and written as text, never as
 // markup. `drivegain` on the window holds it, for the tests.
 const shown = { kept: 0, run: null, points: [], rows: [], events: [], status: null, received: 0,
+  looks: [], guided: null,
   showAxis: (index, status) => showAxis(axes[index], status) };
 window.drivegain = shown;
 const byId = (id) => document.getElementById(id);
@@ -367,7 +368,7 @@ function showResults(found) {
   const parts = found.problems.map((text) => prose("p", text, "alarm"));
   if (found.gains) {
     parts.push(element("h3", `Gains of ${found.gains.file}, fitted ${utc(found.gains.created)}; error on ${found.gains.error}`));
-    parts.push(table(["axis", "gain ± σ", "since nameplate", "error"],
+    parts.push(table(["axis", "gain ± σ", "from nameplate", "error"],
       found.gains.axes.map((one) => [one.axis, `${withDeviation(one.value, one.std)} ${one.unit}`,
         signed(one.change_percent, 2, "%"), `${number(one.error_percent, 2)}\u00a0%`])));
   } else parts.push(prose("p", "No calibration yet. After the recordings: `drivegain fit LOG … --out calibration.yaml`"));
@@ -411,57 +412,145 @@ function drawn(tag, attributes, text) {
   return made;
 }
 
+// Number of a block by its name, from 1.
+function blockNumber(name) {
+  const [, digits] = /^block-(\d+)-/.exec(name) || [];
+  return Number(digits || 0);
+}
+
+// Quick looks at the gains since the last block that was judged.
+function newLooks(precision) {
+  const judged = precision ? precision.progress.at(-1).blocks : 0;
+  return shown.looks.filter((look) => blockNumber(look.block) > judged);
+}
+
+function byAxis(names, values) {
+  return Object.fromEntries(names.map((name, k) => [name, values[k]]));
+}
+
+/** Points of the picture: the estimate after each block, then the quick ones of the moves since. */
+function precisionPoints(precision, looks) {
+  const progress = precision ? precision.progress : [];
+  const last = progress.at(-1);
+  const heldOut = last ? last.motion_s - last.fitted_s : 0;
+  const judged = progress.map((one) => ({ motion_s: one.motion_s, std: byAxis(precision.axes, one.std_percent), quick: false }));
+  const quick = looks.map((look) => ({
+    motion_s: look.motion_s + heldOut,
+    std: byAxis(look.gains.map((gain) => gain.axis), look.gains.map((gain) => gain.std_percent)),
+    quick: true,
+  }));
+  return [...judged, ...quick];
+}
+
 /** σ of each gain over the time of motion, both axes logarithmic: a fall as 1/√time is a straight line. */
-function drawPrecision(precision) {
-  const { progress, axes, target_percent: target, left_s: leftOver } = precision;
+function drawPrecision(points, axes, target, leftOver) {
   const [width, height, left, right, top, bottom] = [640, 260, 48, 70, 12, 32];
-  const times = progress.map((one) => one.motion_s);
-  const values = [target, ...progress.flatMap((one) => one.std_percent)];
-  const [first, last] = [times[0], Math.max(times[0] * 2, times.at(-1) + leftOver)];
+  const values = [target, ...points.flatMap((one) => Object.values(one.std))];
+  const end = points.at(-1);
+  const first = points[0].motion_s;
+  const last = Math.max(first * 2, end.motion_s + leftOver);
   const [low, high] = [Math.min(...values) / 1.3, Math.max(...values) * 1.3];
   const x = (time) => left + (width - left - right) * Math.log(time / first) / Math.log(last / first);
   const y = (value) => top + (height - top - bottom) * Math.log(high / value) / Math.log(high / low);
   const picture = byId("precision");
-  picture.replaceChildren(drawn("title", {}, `Standard deviation of each gain after ${progress.length} looks; target ${target} %`));
+  picture.replaceChildren(drawn("title", {}, `Standard deviation of each gain after ${points.length} looks; target ${target} %`));
   for (const value of [0.1, 0.2, 0.5, 1, 2, 5, 10, 20].filter((one) => one > low && one < high)) {
     picture.append(drawn("line", { class: "grid", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
     picture.append(drawn("text", { x: left - 6, y: y(value) + 4, "text-anchor": "end" }, `${value} %`));
   }
   picture.append(drawn("line", { class: "target", x1: left, x2: width - right, y1: y(target), y2: y(target) }));
   picture.append(drawn("text", { x: width - right + 6, y: y(target) + 4 }, "target"));
-  const ends = axes.map((name, k) => ({ name, k, value: progress.at(-1).std_percent[k] })).sort((a, b) => b.value - a.value);
+  const ends = axes.map((name) => ({ name, value: end.std[name] })).sort((a, b) => b.value - a.value);
   let free = 0;
-  for (const { name, k, value } of ends) {
-    const points = progress.map((one) => `${x(one.motion_s)},${y(one.std_percent[k])}`).join(" ");
+  for (const { name, value } of ends) {
     const kind = value > target ? "sigma coarse" : "sigma";
-    picture.append(drawn("polyline", { class: kind, points }));
-    picture.append(drawn("circle", { class: kind, cx: x(times.at(-1)), cy: y(value), r: 3 }));
+    const line = points.map((one) => `${x(one.motion_s)},${y(one.std[name])}`).join(" ");
+    picture.append(drawn("polyline", { class: kind, points: line }));
+    for (const one of points) {
+      const form = one.quick ? `${kind} quick` : kind;
+      picture.append(drawn("circle", { class: form, cx: x(one.motion_s), cy: y(one.std[name]), r: one.quick ? 2 : 3 }));
+    }
     free = Math.max(y(value) + 4, free + 14); // names do not cover each other
-    picture.append(drawn("text", { x: x(times.at(-1)) + 8, y: free }, `${name} ${number(value, 2)} %`));
+    picture.append(drawn("text", { x: x(end.motion_s) + 8, y: free }, `${name} ${number(value, 2)} %`));
   }
-  for (const time of [first, times.at(-1)]) {
+  for (const time of [first, end.motion_s]) {
     picture.append(drawn("text", { x: x(time), y: height - 8, "text-anchor": "middle" }, `${Math.round(time)} s`));
   }
 }
 
-function showGuided(guided) {
+function duration(seconds) {
+  return seconds < 120 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`;
+}
+
+// The quick estimate after the last move, or what it lacks.
+function quickText(look) {
+  if (look.missing) return `No gains yet: ${look.missing}.`;
+  const listed = look.gains.map((gain) =>
+    `${gain.axis} ${Number(gain.value.toPrecision(4))} ${gain.unit} ± ${number(gain.std_percent, 2)} % (${gain.target_percent} %)`);
+  if (look.is_held_out) return `This block is held out: its moves do not count. Quick estimate so far, gain ± σ (target): ${listed.join(", ")}.`;
+  const head = `Quick estimate after move ${look.move} of ${look.moves}, gain ± σ (target): ${listed.join(", ")}.`;
+  if (look.left_s <= 0) return `${head} All are at the target; the estimate at the end of the block decides.`;
+  return `${head} ${look.gains[0].axis} is worst (${look.why}): about ${duration(look.left_s)} left at this rate.`;
+}
+
+function takeLook(look) {
+  const last = shown.looks.at(-1);
+  if (!look || !look.gains.length || look.is_held_out) return;
+  if (last && last.block === look.block && last.move === look.move) return;
+  shown.looks.push(look);
+}
+
+function showGuided() {
+  const { guided, status } = shown;
   byId("guided").hidden = !guided;
   if (!guided) return;
+  const look = status && status.phase === "running" ? status.quick : null;
+  const moving = movingRun();
   byId("stage").textContent = `Stage: ${guided.stage}. Recorded: ${guided.blocks.join(", ") || "nothing yet"}.`;
-  byId("next-step").textContent = guided.next_step;
+  byId("next-step").textContent = moving ? `The robot moves: ${moving}` : guided.next_step;
   const parts = [];
   const { precision, acceptance } = guided;
-  byId("precision").toggleAttribute("hidden", !precision);
-  if (precision) drawPrecision(precision);
-  if (guided.missing) parts.push(element("p", `Not reached: ${guided.missing}`, "alarm"));
-  else if (guided.stage === "record" && precision && precision.left_s) {
-    parts.push(element("p", `About ${Math.round(precision.left_s)} s of motion are left, if σ falls with the root of the time.`));
+  const looks = newLooks(precision);
+  const points = precisionPoints(precision, looks);
+  byId("precision").toggleAttribute("hidden", !points.length);
+  if (points.length) {
+    const gains = looks.length ? looks.at(-1).gains : [];
+    const names = precision ? precision.axes : gains.map((gain) => gain.axis);
+    const target = precision ? precision.target_percent : gains[0].target_percent;
+    drawPrecision(points, names, target, looks.length ? looks.at(-1).left_s : precision.left_s);
+  }
+  if (look) parts.push(element("p", quickText(look)));
+  if (guided.missing) {
+    parts.push(element("p", `Not reached: ${guided.missing}`, "alarm"));
+    guided.would_help.forEach((text) => parts.push(element("p", `Would help: ${text}`)));
+  } else if (guided.stage === "record" && precision && precision.left_s && !look) {
+    const why = precision.why ? ` ${precision.worst} is worst: ${precision.why}.` : "";
+    parts.push(element("p", `About ${duration(precision.left_s)} of motion are left at this rate.${why}`));
   }
   if (acceptance) {
     const verdict = acceptance.accepted ? "Accepted" : "Not accepted";
     parts.push(element("p", `${verdict}: ${acceptance.remark}`, acceptance.accepted ? "" : "alarm"));
   }
   byId("outlook").replaceChildren(...parts);
+}
+
+// Name of the run that moves the robot now; empty where none does.
+function movingRun() {
+  const { status, run } = shown;
+  if (!status || status.phase !== "running" || status.result || !run || !run.log) return "";
+  return run.log.split("/").at(-1).replace(/\.mcap$/, "");
+}
+
+// What the session's section shows of the recorder, as text to compare.
+function sessionKey() {
+  return JSON.stringify([movingRun(), shown.status && shown.status.quick]);
+}
+
+function takeGuided(guided) {
+  const isOther = !shown.guided || !guided || shown.guided.session !== guided.session;
+  if (isOther && shown.guided) shown.looks = [];
+  shown.guided = guided;
+  showGuided();
 }
 
 let before = "";
@@ -473,7 +562,7 @@ async function look() {
     if (found.stop) showStop(found.stop);
     if (text !== before && "problems" in found) {
       showResults(found);
-      showGuided(found.guided);
+      takeGuided(found.guided);
     }
     before = text;
   } catch { /* the stream reports it */ }
@@ -493,6 +582,7 @@ async function stop() {
 
 function take(message) {
   const { status, new: fresh } = message;
+  const before = sessionKey();
   if ("run" in fresh) {
     Object.assign(shown, { run: fresh.run, points: [], rows: [], events: [], received: 0 });
     byId("alarms").replaceChildren();
@@ -507,6 +597,8 @@ function take(message) {
   shown.received += (fresh.points || []).length;
   shown.status = status;
   changed = true;
+  takeLook(status.quick);
+  if (sessionKey() !== before) showGuided();
   addEvents(fresh.events || []);
   showStatus(status);
 }

@@ -154,6 +154,7 @@ class Results:
             "next_step": position.next_step,
             "blocks": [run.name for run in state.runs],
             "missing": state.missing,
+            "would_help": list(state.would_help),
             "precision": None,
             "acceptance": None,
         }
@@ -185,10 +186,13 @@ class Results:
 
 
 def _precision(state: GuidedState) -> dict[str, Any]:
-    """Return σ of each gain after each judged block, its target, and the motion that is left."""
+    """Return σ of each gain after each judged block, its target, the motion that is left, and why it is."""
+    worst = max(state.gains, key=lambda gain: gain.std_percent / gain.target_percent)
     return {
         "axes": [gain.axis for gain in state.gains],
         "target_percent": state.gains[0].target_percent,
         "progress": [one.model_dump(mode="json") for one in state.progress],
-        "left_s": left_s(state.gains, state.progress[-1].motion_s),
+        "worst": worst.axis,
+        "why": worst.cause,
+        "left_s": left_s(state.gains, state.progress[-1].fitted_s),
     }

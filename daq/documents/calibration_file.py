@@ -19,8 +19,16 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
-from daq.config.document_kind import IN_ORDER, DocumentKind, kind_of_head, kind_of_tree
-from daq.config.yaml_file import StrictModel, parse_yaml, read_file, read_model
+from daq.config.yaml_file import (
+    IN_ORDER,
+    DocumentKind,
+    StrictModel,
+    kind_of_head,
+    kind_of_tree,
+    parse_yaml,
+    read_file,
+    read_model,
+)
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import replace_file
 from ident.calibration import (
@@ -58,7 +66,7 @@ def _check_filter(found: dict[str, int | float | list[float]]) -> dict[str, int 
 
 
 class GainEntry(StrictModel):
-    """One drive gain; the percentages are for people."""
+    """One drive gain with its nameplate; the percentages are for people, `change_percent` from the nameplate."""
 
     axis: str
     value: _Number

@@ -17,7 +17,7 @@ class Outcome(Enum):
 
     NOT_DUE = "not due"  #: The last good calibration is recent enough; no session was begun
     APPLIED = "applied"
-    UNCHANGED = "unchanged"  #: No gain differs significantly from the controller's
+    UNCHANGED = "unchanged"  #: No gain differs significantly from the current gain
     PROPOSED = "proposed"  #: An operator has to apply it
     REFUSED = "refused"  #: A check of the write-back failed
     UNFIT = "unfit"  #: The recordings cannot be used
@@ -54,15 +54,18 @@ class Fitted(StrictModel):
 
 
 class JudgedGain(StrictModel):
-    """A gain beside the one in the controller, with their σ, and whether they differ significantly."""
+    """An identified gain beside the current gain, with their σ, and whether they differ significantly.
+
+    `old` and `new` are keys of `state.json` and of `--json`, which stay.
+    """
 
     axis: str
     unit: str
-    old: float
-    old_std: float
-    new: float
-    new_std: float
-    change_percent: float | None  #: None where the number in the controller is 0
+    old: float  #: current gain
+    old_std: float  #: σ of the current gain; 0 where it is not known
+    new: float  #: identified gain
+    new_std: float  #: σ of the identified gain
+    change_percent: float | None  #: None where the current gain is 0
     drift_sigma: float | None  #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
     differs: bool
 
@@ -82,6 +85,7 @@ class PlannedWrite(StrictModel):
     after_sha256: str
     looked_at: str = ""  #: value for `apply --base`
     unsigned: bool = False  #: required signatures are missing
+    in_drives: bool = False  #: into the drives, not into a file
 
 
 class WatchedGain(StrictModel):
@@ -92,9 +96,9 @@ class WatchedGain(StrictModel):
 
 
 class SessionState(StrictModel):
-    """`state.json`; results of steps that are not done yet are None or missing from the list."""
+    """What all sessions share; results of steps that are not done yet are None or missing from the list."""
 
-    format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
+    format: str  #: kind of session
     version: Literal[1] = 1
     session: str
     cell: str
@@ -116,12 +120,25 @@ class SessionState(StrictModel):
 
     @property
     def is_over(self) -> bool:
-        """Whether no command goes on with it; a command that was killed before it reported its end did not end it."""
-        return self.outcome is not None and self.outcome.concluded and self.ended is not None
+        """Whether no command goes on with it.
+
+        A command that was killed before it reported its end did not end it; nor did one that an error ended behind the
+        decision, before the certificate had it.
+        """
+        if self.outcome is None or self.ended is None:
+            return False
+        is_cut_short = self.outcome.good and bool(self.problem)
+        return self.outcome.concluded and not is_cut_short
 
     def with_(self, **changed: object) -> SessionState:
         """A copy with other values."""
         return self.model_copy(update=changed)
+
+
+class JobState(SessionState):
+    """`state.json` of a scheduled job."""
+
+    format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
 
 
 class Block(StrictModel):
@@ -142,6 +159,7 @@ class GainSoFar(StrictModel):
     value: float
     std_percent: float
     target_percent: float
+    cause: str = ""  #: why it takes long; empty where it is not known
 
     @property
     def is_precise(self) -> bool:
@@ -154,16 +172,17 @@ class Progress(StrictModel):
 
     blocks: _Count
     motion_s: float  #: of these blocks
+    fitted_s: float = 0.0  #: of those that are not held out
     std_percent: tuple[float, ...]  #: of each gain
 
 
 class ScaleOfAxis(StrictModel):
-    """Measured over predicted torque of a joint on new moves: 1 where its gain is right."""
+    """Measured over predicted torque of a joint on new moves: 1 where its gain is right, None where it did not move."""
 
     axis: str
-    old: float  #: with the gain that the controller had
-    new: float  #: with the one that was written
-    std: float  #: σ of the new one
+    old: float | None  #: with the previous gain, which the controller had before the write
+    new: float | None  #: with the current gain, which was written
+    std: float | None  #: σ of the new one
 
 
 class Acceptance(StrictModel):
@@ -171,8 +190,8 @@ class Acceptance(StrictModel):
 
     log_sha256: str
     scales: tuple[ScaleOfAxis, ...]
-    old_error_percent: float  #: of all axes
-    new_error_percent: float
+    old_error_percent: float | None  #: of all axes, with the previous gains; None where it is no number
+    new_error_percent: float | None  #: of all axes, with the current gains
     accepted: bool
     remark: str
 
@@ -180,7 +199,7 @@ class Acceptance(StrictModel):
 class GuidedState(SessionState):
     """`state.json` of a guided session."""
 
-    format: Literal["drivegain-session"] = "drivegain-session"  # type: ignore[assignment]  # another kind of session
+    format: Literal["drivegain-session"] = "drivegain-session"
     blocks: tuple[Block, ...] = ()
     mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
     rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
@@ -191,6 +210,7 @@ class GuidedState(SessionState):
     repeated: tuple[str, ...] = ()  #: names of blocks that were recorded again because of a mistake, once each time
     complete: bool = False  #: nothing is left to record
     missing: str = ""  #: what was not reached when the recording ended, in words
+    would_help: tuple[str, ...] = ()  #: what would help to reach it, a sentence each
     acceptance: Acceptance | None = None
 
     @property

@@ -137,7 +137,7 @@ class Scalar:
 class RewrittenGain:
     """A gain in a document, whose unit may be another."""
 
-    old: float  #: gain there now [unit]
+    current_gain: float  #: gain that the file has there [unit]
     new: float  #: gain as it would be read back from the new text [unit]
     spelling: str  #: the new number in the document; unchanged text where it is the same number
 

@@ -1,20 +1,25 @@
-"""The last stage of a guided session: new moves with what the controller has now, and a verdict."""
+"""The last stage of a guided session: new moves with the current gains, and a verdict."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis
+from daq.errors import ControllerChanged
 from daq.files import sha256_of
-from daq.jobs.context import NextRun, SessionContext
+from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.guided import guided, plan_moves, require_same_cell
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, record_valid
-from daq.jobs.session import Session
+from daq.jobs.reporting import audit_entry, undo_command
+from daq.jobs.session import CALIBRATION, Session
 from daq.jobs.stages import calibration_made
+from daq.ledger.audit import AuditAction
+from daq.ledger.ledger import read_history
 from daq.workflow.validate import Validation
 from ident.calibration import Calibration
 
@@ -28,59 +33,132 @@ TOLERANCE = 0.02  #: Distance from 1 that is no mistake: friction of another mom
 
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """Record a short run of new moves, and compare the torques of old and new gains with the predicted ones."""
+    """Record new moves, and compare the torques by the previous and the current gains with the predicted ones."""
 
     duration_s: float = DURATION_S
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Do nothing where nothing was written, or where the run was judged already."""
+        """Do nothing where nothing was written; the run is made once, and its result entered in the audit log once.
+
+        Raises:
+            DaqError, DriverError: as from a recording, or because the audit log takes no entry.
+        """
         state = guided(session)
-        if state.outcome is not Outcome.APPLIED or state.acceptance is not None:
+        if state.outcome is not Outcome.APPLIED:
             return session
         context = context.within("accept")
+        if state.acceptance is None:
+            session = session.update(acceptance=self._made(context, session))
+        _enter(context, session)
+        return session
+
+    def _made(self, context: SessionContext, session: Session) -> Acceptance:
+        """Make the run, and judge it."""
+        before_motion(context)  # the command may have been started again for this run alone
         require_same_cell(context)
-        last = state.blocks[-1]
+        _require_written(context, session)
+        last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
         seed = context.settings.seed + SEED_STEP
         plan = plan_moves(context, RUN, path, seed, self.duration_s)
         planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)
         context.operator.mount(planned)
         record_valid(context, session, NextRun(planned, plan))
-        acceptance = judge_acceptance(context, session)
-        level = Level.NOTICE if acceptance.accepted else Level.ERROR
-        context.journal.say(level, "accepted" if acceptance.accepted else "not accepted", text=acceptance.remark)
-        return session.update(acceptance=acceptance)
+        return judge_acceptance(context, session)
+
+
+def _require_written(context: SessionContext, session: Session) -> None:
+    """Read the gains back from the drives before anything moves; a file is compared when it is written.
+
+    Raises:
+        ControllerChanged: the drives have other values than those that were written.
+        DriverError: a drive does not answer.
+    """
+    planned = session.state.target
+    if planned is None or not planned.in_drives:
+        return
+    found = context.content_sha256(calibration_made(session))
+    if found != planned.after_sha256:
+        raise ControllerChanged(
+            context.target.subject,
+            found="other values than those that this session wrote",
+            expected="the written gains, read back before the moves that accept them",
+            remedy="nothing has moved; see whether the drives lost power before they saved, or were written since "
+            "(`drivegain history`), and write them again with `drivegain apply --drives`",
+        )
+    context.journal.say(Level.INFO, "the gains were read back from the drives")
+
+
+def _enter(context: SessionContext, session: Session) -> None:
+    """Enter the result in the audit log, unless an earlier command of this session was killed behind that."""
+    acceptance = guided(session).acceptance
+    if acceptance is None:
+        return
+    known = read_history(context.ledger).acceptances
+    if any(one.log_sha256 == acceptance.log_sha256 for one in known):
+        return
+    digest = sha256_of(session.folder / CALIBRATION)
+    details: dict[str, object] = {
+        "calibration_sha256": digest,
+        "log_sha256": acceptance.log_sha256,
+        "old_error_percent": acceptance.old_error_percent,
+        "new_error_percent": acceptance.new_error_percent,
+        "scales": [scale.model_dump() for scale in acceptance.scales],
+        "remark": acceptance.remark,
+    }
+    if acceptance.accepted:
+        audit_entry(context, AuditAction.ACCEPTED, session, details)
+        context.journal.say(Level.NOTICE, "accepted", text=acceptance.remark)
+        return
+    undo = undo_command(context.file, in_drives=context.target.in_drives)
+    audit_entry(context, AuditAction.NOT_ACCEPTED, session, {**details, "undo": undo})
+    context.journal.say(Level.ERROR, "not accepted", text=acceptance.remark, undo=undo)
 
 
 def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     """Compare predicted torques with those of the currents, by the gains before and after the write."""
     calibration = calibration_made(session)
     decision = session.state.decision
-    old_gains = {} if decision is None else {gain.axis: gain.old for gain in decision.gains}
-    before = _predicted(_with_gains(calibration, old_gains), context, session)
+    previous_gains = {} if decision is None else {gain.axis: gain.old for gain in decision.gains}
+    before = _predicted(_with_gains(calibration, previous_gains), context, session)
     after = _predicted(calibration, context, session)
     scales = tuple(
-        ScaleOfAxis(axis=axis, old=old, new=new, std=std)
+        ScaleOfAxis(axis=axis, old=_finite(old), new=_finite(new), std=_finite(std))
         for axis, (old, _), (new, std) in zip(
             context.cell.axis_names, axis_scales(before), axis_scales(after), strict=True
         )
     )
-    off = [one for one in scales if abs(one.new - 1.0) > max(SIGMAS * one.std, TOLERANCE)]
+    off = [one for one in scales if not _is_right(one)]
     remark = (
-        f"the error of the torques is {after.error.total:.2f} % with the new gains, {before.error.total:.2f} % with "
-        "the old ones"
+        f"the error of the torques is {after.error.total:.2f} % with the current gains, {before.error.total:.2f} % "
+        "with the previous gains"
     )
     if off:
-        listed = ", ".join(f"{one.axis} {100.0 * (one.new - 1.0):+.1f} ± {100.0 * one.std:.1f} %" for one in off)
-        remark = f"torques by the new gains are not those that the model predicts: {listed}"
+        listed = ", ".join(_scale_text(one) for one in off)
+        remark = f"torques by the current gains are not those that the model predicts: {listed}"
     return Acceptance(
         log_sha256=sha256_of(log_of(session, RUN)) or "",
         scales=scales,
-        old_error_percent=before.error.total,
-        new_error_percent=after.error.total,
+        old_error_percent=_finite(before.error.total),
+        new_error_percent=_finite(after.error.total),
         accepted=not off,
         remark=remark,
     )
+
+
+def _is_right(scale: ScaleOfAxis) -> bool:
+    """Whether a scale is 1 within its σ; that of an axis that did not move shows nothing, and accepts nothing."""
+    if scale.new is None or scale.std is None:
+        return False
+    bound = max(TOLERANCE, SIGMAS * scale.std)
+    return abs(scale.new - 1.0) <= bound
+
+
+def _scale_text(scale: ScaleOfAxis) -> str:
+    """Say by how much the torque of an axis is off."""
+    if scale.new is None or scale.std is None:
+        return f"{scale.axis} did not move"
+    return f"{scale.axis} {100.0 * (scale.new - 1.0):+.1f} ± {100.0 * scale.std:.1f} %"
 
 
 def axis_scales(found: Validation) -> list[tuple[float, float]]:
@@ -102,12 +180,16 @@ def axis_scales(found: Validation) -> list[tuple[float, float]]:
     return scales
 
 
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
 def _predicted(calibration: Calibration, context: SessionContext, session: Session) -> Validation:
     (found,) = context.tools.validate(calibration, [log_of(session, RUN)], context.cell)
     return found
 
 
 def _with_gains(calibration: Calibration, values: dict[str, float]) -> Calibration:
-    """Return a calibration with the gains that the controller had."""
+    """Return a calibration with other gains, by axis."""
     gains = tuple(replace(gain, value=values.get(gain.axis, gain.value)) for gain in calibration.gains)
     return replace(calibration, gains=gains)

@@ -1,6 +1,6 @@
 """Look at a block right after its recording: a mistake that it shows costs one block then, and not the session.
 
-The body on the flange is weighed with the gains of the data sheet (`ident.weighing`), beside the blocks before. These
+The body on the flange is weighed with the nameplate gains (`ident.weighing`), beside the blocks before. These
 gains may be off by a quarter; a body that was forgotten is off by all of its mass.
 """
 
@@ -21,7 +21,7 @@ from ident.errors import IdentificationError
 from ident.estimators.estimate import RelativeError
 from ident.weighing import weigh
 
-LEAST_SHARE = 0.25  #: Of the payload's mass; a smaller difference is that of the gains of the data sheet
+LEAST_SHARE = 0.25  #: Of the payload's mass; a smaller difference is that of the nameplate gains
 LEAST_SIGMAS = 5.0  #: Of the difference
 COARSE_SHARE = 0.5  #: The same of the payload's mass: a coarser weighing tells nothing
 MOMENT = slice(6, 9)  #: m x, m y and m z among the ten parameters of a body
@@ -66,7 +66,7 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
     if not others:
         return BlockFacts(saturated_percent=saturated)
     try:
-        body = weigh(_of_data_sheet(cell), model_of(cell), (run,), cell.conditioning, bare=others)
+        body = weigh(_with_nameplate_gains(cell), model_of(cell), (run,), cell.conditioning, bare=others)
     except IdentificationError:
         return BlockFacts(saturated_percent=saturated)
     if not np.isfinite(body.mass_kg):
@@ -180,15 +180,15 @@ def _beside_bare(
     lower, upper = SAME_BODY
     if not lower <= added_kg / mass_kg <= upper:
         text = (
-            f"The flange carried about {added_kg:.2g} kg by the gains of the data sheet, and {name} has "
-            f"{mass_kg:g} kg: another body was mounted, or these gains are far off."
+            f"The flange carried about {added_kg:.2g} kg by the nameplate gains, and {name} has "
+            f"{mass_kg:g} kg: another body was mounted, or the nameplate is far off."
         )
         return Mistake((last.name,), text)
     return None
 
 
-def _of_data_sheet(cell: Cell) -> Calibration:
-    """Return a calibration that has the gains of the data sheet, and nothing else."""
+def _with_nameplate_gains(cell: Cell) -> Calibration:
+    """Return a calibration that has the nameplate gains, and nothing else."""
     gains = tuple(
         Gain(axis=axis.name, value=axis.nameplate_gain, std=0.0, unit=axis.gain_unit, nameplate=axis.nameplate_gain)
         for axis in cell.axes

@@ -14,17 +14,19 @@ from daq.documents.session_state import GuidedState
 from daq.errors import ConfigurationInconsistent, DaqError
 from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, target_of
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
+from daq.jobs.gain_target import target_of
 from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
+from daq.jobs.position import goes_on_with
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Basis, Session
-from daq.jobs.stages import TO_DECISION, Stage, run_stages
+from daq.jobs.stages import TO_DECISION, Certify, Stage, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
-from drivers.errors import DriverError
+from drivers.errors import DriverError, all_notes
 
 RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
 
@@ -57,14 +59,27 @@ def calibrate(
             session = run_stages(stages_of(settings), context, session)
         except BaseException as error:
             report_failure(context, session.folder, error)
+            _name_next_step(session.folder, error)
             raise
         return report_success(context, session)
 
 
+def _name_next_step(folder: Path, error: BaseException) -> None:
+    """Add to an error which blocks the session has, and what the same command does next."""
+    found = next((one for one in sessions.sessions(folder.parent) if one.folder == folder), None)
+    if found is None or found.finished or not isinstance(found.state, GuidedState):
+        return
+    blocks = ", ".join(run.name for run in found.state.runs)
+    is_taken = any(note.startswith("kept: ") for note in all_notes(error))  # by what could not be recorded
+    if not is_taken:
+        error.add_note(f"kept: {blocks or 'no block yet'}")
+    error.add_note(f"hint: remove the cause, then start the same command: {goes_on_with(found.state)}")
+
+
 def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
-    """Return the stages of a guided session: those of the job, then the acceptance."""
+    """Return the stages of a guided session: as a job, but for rehearsal and acceptance."""
     rehearsal = (Rehearse(UntilPrecise(settings)),) if settings.rehearse else ()
-    return (*rehearsal, *TO_DECISION, Accept())
+    return (*rehearsal, *TO_DECISION, Accept(), Certify())
 
 
 def context_of(
@@ -123,7 +138,7 @@ def check_readiness(context: SessionContext, payload: str | None, block_s: float
         _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
         _checked("payload", lambda: _payload_text(context.cell, payload)),
         _checked("disk, interlock, drives", lambda: _ready_text(context)),
-        _checked("gains that a first session can show", lambda: _predicted_text(context, block_s)),
+        _checked("expected precision", lambda: _predicted_text(context, block_s)),
     )
 
 
@@ -175,4 +190,4 @@ def _predicted_text(context: SessionContext, block_s: float) -> str:
     plan = context.tools.plan(context.cell, seed=context.settings.seed, duration_s=block_s)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
-    return f"σ predicted for one bare and one loaded block: {listed}"
+    return f"predicted σ after one bare and one loaded block: {listed}"

@@ -1,26 +1,47 @@
-"""The certificate of a calibration that a session has made."""
+"""The certificate of a calibration that a session has made: first before its decision, and again behind it.
+
+The page needs the fit for its details, and a command that goes on with a session does not have it any more. So they are
+kept in a file beside the page, and the page is made again from calibration, audit log and this file.
+"""
 
 from __future__ import annotations
 
 import shlex
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 from daq.config.cell import Cell
-from daq.jobs.session import CALIBRATION
-from daq.report.certificate import Certificate, certify
-from daq.report.comparison import compare
-from daq.report.residual_page import save_report
+from daq.config.yaml_file import StrictModel
+from daq.errors import writing
+from daq.files import read_regular, replace_file
+from daq.jobs.session import CALIBRATION, REPORT
+from daq.report.certificate import Certificate, Origin, certify
+from daq.report.certificate_page import certificate_page
+from daq.report.comparison import Comparison, compare
+from daq.report.residual_page import PAGE, PageDetails, page_details, save_report
 from daq.workflow.fit import Fit
 from daq.writeback.request import Request
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account
 
+DETAILS = "details.json"  #: Beside the page
+LARGEST_BYTES = 64 << 20  #: Of the details; drawings of a long session take a few megabytes
+
+
+class StoredDetails(StrictModel):
+    """The details of a page in their file."""
+
+    format: Literal["drivegain-page-details"] = "drivegain-page-details"
+    version: Literal[1] = 1
+    consequence: str
+    sections: tuple[str, ...]
+
 
 def save_certificate(
     cell_file: Path, cell: Cell, fitted: Fit, changed: Account, calibration: Calibration, folder: Path
 ) -> Certificate:
-    """Write the page of a session, with the gains beside those in the controller.
+    """Write the page of a session, with the gains beside the current ones.
 
     Args:
         cell_file: for the command that the page shows.
@@ -33,7 +54,50 @@ def save_certificate(
     Raises:
         OutputFailed: the file system refuses.
     """
-    command = f"drivegain apply {shlex.quote(str(cell_file))} {shlex.quote(str(folder.parent / CALIBRATION))}"
-    comparison = compare(cell, Request(calibration, datetime.now(UTC)), command)
-    save_report(fitted, changed, calibration, folder, comparison, session=folder.parent.name)
+    session = folder.parent
+    comparison = _compared(cell_file, cell, calibration, session, datetime.now(UTC))
+    found = page_details(fitted, changed, calibration)
+    details = StoredDetails(consequence=found.consequence, sections=found.sections)
+    with writing(folder):
+        replace_file(folder / DETAILS, details.model_dump_json().encode())
+    save_report(fitted, changed, calibration, folder, comparison, session=session.name)
     return certify(calibration, comparison)
+
+
+def renew_certificate(
+    cell_file: Path, cell: Cell, calibration: Calibration, session: Path, now: datetime
+) -> Certificate:
+    """Write the page of a session again, with what the audit log says by now.
+
+    Args:
+        cell_file: for the command that the page shows.
+        cell: of the session.
+        calibration: of the session.
+        session: its folder.
+        now: wall clock.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    comparison = _compared(cell_file, cell, calibration, session, now)
+    certificate = certify(calibration, comparison, origin=Origin.of(calibration, session.name))
+    report = session / REPORT
+    details = read_details(report / DETAILS)
+    page = certificate_page(certificate, details.consequence, details.sections)
+    with writing(report / PAGE):
+        replace_file(report / PAGE, page.encode())
+    return certificate
+
+
+def read_details(path: Path) -> PageDetails:
+    """Return the details of a page; none where their file is missing or cannot be read."""
+    try:
+        stored = StoredDetails.model_validate_json(read_regular(path, LARGEST_BYTES))
+    except (OSError, ValueError):
+        return PageDetails("", ())
+    return PageDetails(stored.consequence, stored.sections)
+
+
+def _compared(cell_file: Path, cell: Cell, calibration: Calibration, session: Path, now: datetime) -> Comparison:
+    command = f"drivegain apply {shlex.quote(str(cell_file))} {shlex.quote(str(session / CALIBRATION))}"
+    return compare(cell, Request(calibration, now), command)

@@ -7,33 +7,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from daq.config.cell import Cell, MotionPolicy
-from daq.config.controller import Controller
-from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
 from daq.jobs.block_check import BlockFacts, look_at_block
+from daq.jobs.certificate import renew_certificate
+from daq.jobs.gain_target import GainTarget, NetworkMaker
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.session import Session
 from daq.ledger.ledger import Ledger, read_history
+from daq.report.certificate import Certificate
 from daq.report.plan_preview import save_preview
+from daq.workflow.choices import LARGEST_STD_PERCENT
+from daq.workflow.experiment import Experiment
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.interlock import Runner, release_check, run_command
-from daq.workflow.plan import Plan, plan
+from daq.workflow.plan import Plan, PlanGoal, TargetBox, plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
 from daq.workflow.validate import Validation, validate
-from daq.writeback.file_access import resolve_links
-from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
-from daq.writeback.target import Proposal, Written, apply, propose
+from daq.writeback.target import Proposal, Target, Written, apply, propose
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.setup import read_consumers
 from drivers.errors import DriveFault, MotionRefused, StateRefused
@@ -151,7 +152,20 @@ def _refused(axis: Axis, statusword: int, remedy: str) -> StateRefused:
 class Planner(Protocol):
     """Makes a plan of a cell."""
 
-    def __call__(self, cell: Cell, *, seed: int, duration_s: float) -> Plan:
+    def __call__(
+        self,
+        cell: Cell,
+        /,
+        *,
+        seed: int,
+        duration_s: float,
+        speed: float = 1.0,
+        largest_condition: float | None = None,
+        largest_std_percent: float = LARGEST_STD_PERCENT,
+        experiment: Experiment | None = None,
+        goal: PlanGoal | None = None,
+        box: TargetBox | None = None,
+    ) -> Plan:
         """As `daq.workflow.plan.plan`."""
 
 
@@ -193,7 +207,7 @@ class Validator(Protocol):
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
-    def __call__(self, proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str) -> Written | None:
+    def __call__(self, proposal: Proposal[Any], now: datetime, *, audit: Path, who: str) -> Written | None:
         """As `daq.writeback.target.apply`."""
 
 
@@ -212,22 +226,15 @@ class Tools:
     close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[[Evidence, Sequence[Step]], Account] = account
-    propose: Callable[[FileTarget, Request], Proposal[FileEdit]] = propose
+    network: NetworkMaker = network_of  #: opens the drives that hold gains
+    propose: Callable[[Target[Any], Request], Proposal[Any]] = propose
     apply: ChangeWriter = apply
     validate: Validator = validate
+    certify: Callable[[Path, Cell, Calibration, Path, datetime], Certificate] = renew_certificate
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk
     now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone
     monotonic_s: Callable[[], float] = time.monotonic  #: clock for durations [s]
-
-
-@dataclass(frozen=True, slots=True)
-class GainTarget:
-    """Controller file that a job writes, and the history of its cell."""
-
-    controller: Controller  #: its declaration in the cell file
-    file: Path  #: absolute path
-    history: HistoryPlace  #: files of history and audit
 
 
 class SessionSettings(Protocol):
@@ -303,7 +310,7 @@ class SessionContext:
     settings: SessionSettings  #: limits and places of the session
     schedule: Schedule  #: which runs it consists of
     operator: Operator  #: who mounts, permits motion and approves
-    target: GainTarget  #: controller file that the gains are compared with and written to
+    target: GainTarget  #: place that the gains are compared with and written to
     tools: Tools  #: functions that the stages call
     journal: Journal  #: log of the session, labelled with session and stage
     began_s: float = 0.0  #: start on the monotonic clock [s]
@@ -314,6 +321,14 @@ class SessionContext:
         """Name of the operator in audit and logs."""
         return self.operator.who
 
+    def opened_target(self) -> AbstractContextManager[Target[Any]]:
+        """Open the place of the gains; see `GainTarget.opened`."""
+        return self.target.opened(self.tools.network, self.block_signals)
+
+    def content_sha256(self, calibration: Calibration) -> str | None:
+        """Return the SHA-256 of what is in the place of the gains now; see `GainTarget.content_sha256`."""
+        return self.target.content_sha256(calibration, self.tools.network, self.block_signals)
+
     @property
     def ledger(self) -> Ledger:
         """The ledger of the cell."""
@@ -323,25 +338,6 @@ class SessionContext:
     def within(self, stage: str) -> SessionContext:
         """The same context, with a journal that names the stage."""
         return replace(self, journal=replace(self.journal, step=stage))
-
-
-def target_of(cell: Cell) -> GainTarget:
-    """Find the controller file of a cell.
-
-    Raises:
-        ConfigurationInconsistent: the cell names no controller file.
-        ControllerUnfit: it is a symbolic link that a write would not follow (`daq.writeback.file_access`).
-    """
-    file = cell.controller_path
-    if cell.controller is None or file is None or cell.history is None:
-        raise ConfigurationInconsistent(
-            f"cell {cell.name!r}: controller",
-            found="no file",
-            expected="a controller's file: a job compares its gains with those in it",
-            remedy="name it in the cell file; what is kept in drives alone is recorded and applied by hand",
-        )
-    resolve_links(file)  # refused now, not after an hour of recordings
-    return GainTarget(cell.controller, file, cell.history)
 
 
 def section_of(cell: Cell) -> Recalibration:

@@ -1,9 +1,11 @@
-"""Compare a calibration with the gains in the controller, and write it where the operator approves."""
+"""Compare a calibration with the current gains, and write it where the operator approves."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import datetime
+from typing import Any
 
 from daq.documents.calibration_file import read_calibration_bytes
 from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite
@@ -18,8 +20,6 @@ from daq.ledger.fold import History
 from daq.ledger.ledger import record_session
 from daq.report.document import json_text
 from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
-from daq.writeback.file_access import resolve_links
-from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate
 from daq.writeback.judgement import Spread, judge, known_of
 from daq.writeback.request import GainChange, Request
@@ -32,7 +32,7 @@ DIFF = "proposal.diff"
 
 
 def decide_outcome(context: SessionContext, session: Session, calibration: Calibration, history: History) -> Session:
-    """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
+    """Compare a calibration with the current gains, and act on it; the outcome is in the returned state.
 
     Raises:
         CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
@@ -42,27 +42,29 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
     now = context.tools.now()
     digest = sha256_of(path) or ""
     before = session.state.target
-    if before is not None and before.base_sha256 != before.after_sha256 == sha256_of(context.target.file):
-        # The job was killed right after its write: the history has it by now, and it is never repeated.
-        words = "the controller's file has these gains already: an earlier job of this session wrote it"
-        context.journal.say(Level.NOTICE, words)
-        return session.update(outcome=Outcome.APPLIED)
-    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    proposal = context.tools.propose(FileTarget.of(context.cell), request)
-    edit = proposal.edit
-    decision = decision_of(proposal, known_of(history, str(resolve_links(context.target.file)), digest, edit.changes))
-    differs = any(gain.differs for gain in decision.gains)
     touched = _written_since(context, session)
+    if before is not None and _has_written(context, before, calibration):
+        if touched or not context.target.in_drives:
+            # The job was killed right after its write: the history has it by now, and it is never repeated.
+            words = "the controller has these gains already: an earlier job of this session wrote them"
+            context.journal.say(Level.NOTICE, words)
+            return session.update(outcome=Outcome.APPLIED)
+        return _saved_again(context, session, calibration)
+    proposal = _proposed(context, Request(calibration, now, file=path, content=read_calibration_bytes(path)))
+    edit = proposal.edit
+    decision = decision_of(proposal, known_of(history, context.target.subject, digest, edit.changes))
+    differs = any(gain.differs for gain in decision.gains)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
     context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(edit.after)
     target = PlannedWrite(
-        file=str(edit.file),
+        file=str(edit.name),
         base_sha256=edit.base_sha256,
         after_sha256=after,
         looked_at=edit.base,
         unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
+        in_drives=context.target.in_drives,
     )
     _write_proposal(session, proposal, after)
     # Before anything is written: after a kill, the digest of the file shows whether it was.
@@ -81,7 +83,7 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
             AuditAction.PROPOSED,
             at=context.tools.now(),
             who=context.who,
-            subject=str(resolve_links(context.target.file)),
+            subject=context.target.subject,
             details={
                 "session": session.state.session,
                 "calibration_sha256": digest,
@@ -91,30 +93,68 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
         )
         context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
         return session.update(outcome=Outcome.PROPOSED)
+    return _written(context, session, proposal, now)
+
+
+def _written(context: SessionContext, session: Session, proposal: Proposal[Any], now: datetime) -> Session:
+    """Write a change that the operator has approved."""
     written = _apply(context, proposal, now)
     if written is not None:
-        context.journal.say(
-            Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup)
-        )
+        subject = proposal.edit.subject
+        context.journal.say(Level.NOTICE, "written to the controller's file", file=subject, backup=str(written.backup))
         if written.not_in_history:
             words = "the history does not have this write; the next job, apply or history --add enters it"
             context.journal.say(Level.WARNING, words, text=written.not_in_history)
     return session.update(outcome=Outcome.APPLIED)
 
 
-def _apply(context: SessionContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
-    with writing(proposal.edit.file):
-        return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
+def _has_written(context: SessionContext, before: PlannedWrite, calibration: Calibration) -> bool:
+    """Whether an earlier job of this session has put its content in place."""
+    if before.base_sha256 == before.after_sha256:
+        return False
+    return context.content_sha256(calibration) == before.after_sha256
 
 
-def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
-    """Judge which gains differ significantly from the controller's (`daq.writeback.judgement`), each among all axes."""
+def _saved_again(context: SessionContext, session: Session, calibration: Calibration) -> Session:
+    """Let drives save what a killed job wrote: without its last entry in the audit log, they may not have saved."""
+    now = context.tools.now()
+    path = session.folder / CALIBRATION
+    proposal = _proposed(context, Request(calibration, now, file=path, content=read_calibration_bytes(path)))
+    context.journal.say(Level.NOTICE, "the drives have these gains, and may not have saved them")
+    if proposal.refusals or not context.operator.approve(proposal, touched=False):
+        return session.update(outcome=Outcome.PROPOSED)
+    return _written(context, session, proposal, now)
+
+
+def _proposed(context: SessionContext, request: Request) -> Proposal[Any]:
+    with context.opened_target() as target:
+        return context.tools.propose(target, request)
+
+
+def _apply(context: SessionContext, proposal: Proposal[Any], now: datetime) -> Written | None:
+    """Write what was proposed.
+
+    The bus is not kept open while the operator looks at the change. What is in the drives is read again, and another
+    change than the one that was looked at is refused.
+    """
+    audit = context.target.history.audit
+    with writing(proposal.edit.place):
+        if proposal.refusals or not context.target.in_drives:
+            return context.tools.apply(proposal, now, audit=audit, who=context.who)
+        with context.opened_target() as target:
+            request = replace(proposal.request, base=proposal.edit.base)
+            again = context.tools.propose(target, request)
+            return context.tools.apply(again, now, audit=audit, who=context.who)
+
+
+def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
+    """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`), each among all axes."""
     judged, words = judge(proposal.edit.changes, known)
     gains = tuple(
         JudgedGain(
             axis=change.axis,
             unit=change.unit,
-            old=change.old,
+            old=change.current_gain,
             new=change.new,
             old_std=known.stds[change.axis],
             new_std=change.std,
@@ -140,16 +180,16 @@ def _written_since(context: SessionContext, session: Session) -> bool:
         for index, entry in enumerate(entries)
         if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
     ]
-    file = str(resolve_links(context.target.file))
+    file = context.target.subject
     ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
     # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
     return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
 
 
-def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
+def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
     """Write the change beside the calibration, as JSON and as a diff."""
     report = ProposalReport(
-        file=str(proposal.edit.file),
+        file=str(proposal.edit.name),
         base_sha256=proposal.edit.base_sha256,
         after_sha256=after_sha256,
         changes=[_proposed_gain(change) for change in proposal.edit.changes],
@@ -164,7 +204,7 @@ def _proposed_gain(change: GainChange) -> ProposedGain:
     return ProposedGain(
         axis=change.axis,
         key=change.key,
-        old=change.old,
+        old=change.current_gain,
         new=change.new,
         std=change.std,
         unit=change.unit,

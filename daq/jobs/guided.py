@@ -4,12 +4,17 @@ The first three blocks are bare, loaded, and loaded again but held out: with the
 change of the payload is enough. Where they are not precise yet, blocks follow in pairs, loaded, bare, bare, loaded, so
 that the means of the bare and of the loaded blocks lie at the same time. Friction that changes slowly as the arm gets
 warm is then the same for both, and does not become gain.
+
+The moves of the first three blocks are for all gains. Those of every later block are for the gain that is farthest from
+its target by then, inside the room and the speed of the first three, which the operator has looked at.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import count
 from pathlib import Path
@@ -20,15 +25,19 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import DEFAULT_TARGET_SIGMA_PERCENT
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
-from daq.errors import ConfigurationInconsistent, JobHeld, writing
+from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, writing
 from daq.jobs.block_check import compared_with, mistake_in
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, move_without_log
 from daq.jobs.session import Session
+from daq.workflow.accepted_room import AcceptedRoom, accepted_room
+from daq.workflow.experiment import Experiment, experiment_of
+from daq.workflow.outlook import Outlook, help_with, outlook_of
 from daq.workflow.plan import Plan, load_plan, save_plan, slowed
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate
+from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
 MAX_REPETITIONS = 3  #: Of one block, before the session is held
@@ -69,6 +78,19 @@ class GuidedSettings:
     keep_sessions: int = 20
     metrics: Path | None = None
     rehearse: bool = False  #: make the moves of the first blocks once at low speed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockEstimate:
+    """What the blocks so far say of the gains."""
+
+    gains: tuple[GainSoFar, ...]  #: empty where they cannot be identified yet
+    outlook: Outlook | None = None  #: None where every gain is precise, or none is known
+
+    @property
+    def worst(self) -> GainSoFar:
+        """The gain that is farthest from its target."""
+        return max(self.gains, key=lambda gain: gain.std_percent / gain.target_percent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +146,11 @@ class UntilPrecise:
             holdout=role is BlockRole.HELD_OUT,
             plan=plan_name(number),
         )
-        plan = self.plan_block(context, number, session.folder / block.plan)
+        path = session.folder / block.plan
+        if number < len(FIRST_BLOCKS):
+            plan = self.plan_block(context, number, path)
+        else:
+            plan = self._later_plan(context, session, number, path)
         # In the place of one that is recorded again.
         blocks = (*state.blocks[:number], block, *state.blocks[number:])
         session = session.update(blocks=blocks)
@@ -173,16 +199,19 @@ class UntilPrecise:
         return session.update(blocks=blocks, runs=runs, checked_blocks=len(blocks), repeated=repeated)
 
     def _judged(self, context: SessionContext, session: Session) -> Session:
-        """Judge the gains by all blocks."""
+        """Judge the gains by all blocks, and plan the next one for the worst gain."""
         state = guided(session)
         recorded = len(state.blocks)
         if recorded < len(FIRST_BLOCKS) or state.judged_blocks == recorded:
             return session
-        gains = self._gains(context, session)
+        estimate = self._estimate(context, session)
+        gains = estimate.gains
         motion_s = recorded * self.settings.block_s
+        fitted_s = self.settings.block_s * sum(not block.holdout for block in state.blocks)
         progress = state.progress
         if gains:
-            now = Progress(blocks=recorded, motion_s=motion_s, std_percent=tuple(gain.std_percent for gain in gains))
+            std_percent = tuple(gain.std_percent for gain in gains)
+            now = Progress(blocks=recorded, motion_s=motion_s, fitted_s=fitted_s, std_percent=std_percent)
             progress = (*progress, now)
             context.journal.say(
                 Level.INFO,
@@ -190,25 +219,111 @@ class UntilPrecise:
                 gains=[gain.model_dump() for gain in gains],
                 blocks=recorded,
                 motion_s=motion_s,
-                left_s=left_s(gains, motion_s),
+                left_s=left_s(gains, fitted_s),
             )
-        precise = bool(gains) and all(gain.is_precise for gain in gains)
+        has_held_out = any(block.holdout for block in state.blocks)
+        is_precise = bool(gains) and all(gain.is_precise for gain in gains) and has_held_out
         is_time_up = motion_s >= 60.0 * self.settings.time_limit_min
-        missing = "" if precise or not is_time_up else _missing(gains, self.settings.time_limit_min)
+        missing = ""
+        would_help: tuple[str, ...] = ()
+        if is_time_up and not is_precise:
+            missing = _missing(gains, self.settings.time_limit_min)
+            would_help = _would_help(estimate, motion_s, fitted_s)
+            context.journal.say(Level.NOTICE, "time is up", missing=missing, would_help=would_help)
+        elif not is_precise:
+            self._plan_next(context, session, estimate)
         return session.update(
             gains=gains,
             progress=progress,
             judged_blocks=recorded,
-            complete=precise or is_time_up,
+            complete=is_precise or is_time_up,
             missing=missing,
+            would_help=would_help,
         )
+
+    def _plan_next(self, context: SessionContext, session: Session, estimate: BlockEstimate) -> None:
+        """Plan the next block for the worst gain; nothing is planned where the gains are not known yet."""
+        outlook = estimate.outlook
+        number = _next_number(guided(session))
+        if outlook is None or number < len(FIRST_BLOCKS):
+            return
+        experiment = experiment_of(context.cell, self.settings.payload)
+        room = self._accepted_room(context, session, experiment)
+        is_loaded = role_of(number) is not BlockRole.BARE
+        seed = self.settings.seed + number
+        duration_s = self.settings.block_s
+        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+        made = context.tools.plan(
+            context.cell,
+            seed=seed,
+            duration_s=duration_s,
+            speed=room.speed,
+            # More moves never make what is known worse.
+            largest_condition=np.inf,
+            largest_std_percent=np.inf,
+            experiment=outlook.experiment(experiment, is_loaded=is_loaded, room=room),
+            goal=outlook.goal(self.settings.target_percent),
+            box=room.box,
+        )
+        worst = estimate.worst
+        axis = context.cell.axis_names.index(worst.axis)
+        predicted_percent = float(outlook.scale[axis]) * made.predicted_std_percent[axis]
+        purpose = (
+            f"the gain that is farthest from its target after {len(guided(session).blocks)} blocks: {worst.axis}, "
+            f"± {worst.std_percent:.2f} % (target {worst.target_percent:g} %). With these moves ± "
+            f"{predicted_percent:.2f} % is predicted. They stay between the joint positions of the first blocks, and "
+            "are no faster."
+        )
+        write_plan(context, session.folder / plan_name(number), replace(made, purpose=purpose))
+
+    def _later_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
+        """Load the moves that were planned for the worst gain; where there are none, make some for all gains."""
+        planned = None
+        with suppress(ConfigurationError):  # what is missing or damaged is made again
+            planned = load_plan(path, context.cell)
+        if planned is None:
+            planned = self._unaimed_plan(context, session, number, path)
+        say_moves(context, name_of(number), path)
+        return planned
+
+    def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
+        """Make moves for all gains, inside the room of the first blocks."""
+        experiment = experiment_of(context.cell, self.settings.payload)
+        room = self._accepted_room(context, session, experiment)
+        seed = self.settings.seed + number
+        duration_s = self.settings.block_s
+        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+        inside = replace(experiment, scene=room.scene(experiment.scene))
+        made = context.tools.plan(
+            context.cell, seed=seed, duration_s=duration_s, speed=room.speed, experiment=inside, box=room.box
+        )
+        return write_plan(context, path, made)
+
+    def _accepted_room(self, context: SessionContext, session: Session, experiment: Experiment) -> AcceptedRoom:
+        """Return room and speed of the first blocks, which the operator has looked at before they were recorded.
+
+        Raises:
+            ConfigurationInconsistent: none of their plans can be read any more.
+        """
+        plans = []
+        for number in range(len(FIRST_BLOCKS)):
+            with suppress(ConfigurationError):  # the room of the others is smaller, and was accepted, too
+                plans.append(load_plan(session.folder / plan_name(number), context.cell))
+        if not plans:
+            raise ConfigurationInconsistent(
+                str(session.folder),
+                found="no plan of the first blocks that can be read",
+                expected="plan-1.yaml, plan-2.yaml or plan-3.yaml: later moves stay inside the room of these",
+                remedy="nothing moves; put one of them back, or begin a new session in another folder (--sessions)",
+            )
+        return accepted_room(context.cell, experiment.scene, plans)
 
     def plan_block(self, context: SessionContext, number: int, path: Path) -> Plan:
         """Make the moves of a block by its number from 0."""
         return plan_moves(context, name_of(number), path, self.settings.seed + number, self.settings.block_s)
 
-    def _gains(self, context: SessionContext, session: Session) -> tuple[GainSoFar, ...]:
-        """Return the gains of the blocks so far; none where they cannot be identified yet."""
+    def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
+        """Estimate the gains of the blocks so far; none where they cannot be identified yet."""
         runs = self.runs(session)
         logs = [log_of(session, run.name) for run in runs if not run.holdout]
         unseen = [log_of(session, run.name) for run in runs if run.holdout]
@@ -217,13 +332,19 @@ class UntilPrecise:
             fitted = context.tools.fit(logs, holdout=unseen)
             gains = gains_so_far(context, fitted.estimate, target_percent)
             if all(gain.is_precise for gain in gains):
-                return gains
+                return BlockEstimate(gains)
             # What the model lacks is noise to it: a gain may be precise as soon as that is found.
             closed = context.tools.close_loop(fitted, self.settings.seed, lambda _: None)
-            return gains_so_far(context, closed.estimate, target_percent)
+            gains = gains_so_far(context, closed.estimate, target_percent)
         except IdentificationError as error:
             context.journal.say(Level.WARNING, "the blocks so far do not give the gains", text=str(error))
-            return ()
+            return BlockEstimate(())
+        std_percent = np.array([gain.std_percent for gain in gains])
+        outlook = outlook_of(fitted, experiment_of(context.cell, self.settings.payload), std_percent)
+        explained = tuple(
+            gain.model_copy(update={"cause": cause.value}) for gain, cause in zip(gains, outlook.causes, strict=True)
+        )
+        return BlockEstimate(explained, outlook)
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,14 +402,29 @@ def plan_moves(context: SessionContext, run: str, path: Path, seed: int, duratio
         OutputFailed: the file system refuses.
     """
     context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+    plan = write_plan(context, path, context.tools.plan(context.cell, seed=seed, duration_s=duration_s))
+    say_moves(context, run, path)
+    return plan
+
+
+def write_plan(context: SessionContext, path: Path, made: Plan) -> Plan:
+    """Write the moves of a run, and a page that shows them; return them as a person can read them.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
     with writing(path):
-        save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
-    plan = load_plan(path, context.cell)  # as a person can read it
+        save_plan(made, path)
+    plan = load_plan(path, context.cell)
     page = path.with_suffix(".html")
     with writing(page):
         context.tools.preview(context.cell, plan, path, page)
-    context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(page))
     return plan
+
+
+def say_moves(context: SessionContext, run: str, path: Path) -> None:
+    """Say where the page is that shows the moves of a run."""
+    context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html")))
 
 
 def require_same_cell(context: SessionContext) -> None:
@@ -309,10 +445,17 @@ def require_same_cell(context: SessionContext) -> None:
 
 
 def left_s(gains: Sequence[GainSoFar], motion_s: float) -> float:
-    """Return the motion that is left until every gain is at its target, if σ falls as 1/√time [s]; 0 without gains."""
-    ratios = [gain.std_percent / gain.target_percent for gain in gains]
-    worst = max(ratios, default=0.0)
-    return max(0.0, motion_s * (worst**2 - 1.0))
+    """Return the motion that is left until every gain is at its target, if σ falls as 1/√time [s]; 0 without gains.
+
+    Args:
+        gains: so far.
+        motion_s: motion behind them [s].
+    """
+    if not gains:
+        return 0.0
+    std_percent = np.array([gain.std_percent for gain in gains])
+    target_percent = np.array([gain.target_percent for gain in gains])
+    return time_to_target(std_percent, target_percent, motion_s).longest_s
 
 
 def gains_so_far(context: SessionContext, estimate: Estimate, target_percent: float) -> tuple[GainSoFar, ...]:
@@ -363,3 +506,19 @@ def _missing(gains: tuple[GainSoFar, ...], minutes: float) -> str:
     coarse = [gain for gain in gains if not gain.is_precise]
     listed = ", ".join(f"{gain.axis} {gain.std_percent:.2f} %" for gain in coarse)
     return f"σ after {minutes:g} min of motion: {listed}; the target is {coarse[0].target_percent:g} %"
+
+
+def _would_help(estimate: BlockEstimate, motion_s: float, fitted_s: float) -> tuple[str, ...]:
+    """Say what would help to reach the target: more time, and for each axis what its slowness comes from."""
+    if not estimate.gains:
+        return ("see above why the gains are not known; correct that, and record again",)
+    needed_min = math.ceil((motion_s + left_s(estimate.gains, fitted_s)) / 60.0)
+    found = [f"more time: about {needed_min} min of motion in all at this rate (--time-limit {needed_min})"]
+    if estimate.outlook is None:
+        return tuple(found)
+    for gain, cause in zip(estimate.gains, estimate.outlook.causes, strict=True):
+        if gain.is_precise:
+            continue
+        remedy = help_with(cause, gain.axis)
+        found.append(f"{gain.axis}: {cause.value}" + (f"; {remedy}" if remedy else ""))
+    return tuple(found)

@@ -16,13 +16,14 @@ from daq.config.recalibration import Recalibration
 from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, TimeBoundReached
 from daq.jobs import session as sessions
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of, target_of
+from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of
+from daq.jobs.gain_target import file_of
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import CellPolicy
 from daq.jobs.recording import FixedRuns, basis_of, calibration_of_session, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Session
-from daq.jobs.stages import TO_DECISION, run_stages
+from daq.jobs.stages import OF_JOB, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
@@ -66,7 +67,7 @@ def recalibrate(
                     with block_signals() as asked_again, in_time():
                         yield asked_again
 
-                session = run_stages(TO_DECISION, replace(context, block_signals=block_both), session)
+                session = run_stages(OF_JOB, replace(context, block_signals=block_both), session)
         except BaseException as error:
             report_failure(context, session.folder, error)
             raise
@@ -105,9 +106,9 @@ def preview(
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
-        steps += ["fit and close the loop"]
-    steps += ["compare with the controller's gains", f"apply by {cell.apply.by.value}", "report"]
-    taken = "a new session" if session is None else f"session {session.state.session} is taken up"
+        steps += ["identify gains and missing effects"]
+    steps += ["compare with the current gains", f"write, approved by: {cell.apply.by.value}", "report"]
+    taken = "a new session" if session is None else f"session {session.state.session} continues"
     return Preview(tuple(steps), taken)
 
 
@@ -120,7 +121,7 @@ def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: s
         section,
         FixedRuns(section.runs),
         CellPolicy(cell, section, who, tools.run),
-        target_of(cell),
+        file_of(cell),
         tools,
         journal,
         began_s=tools.monotonic_s(),
@@ -185,8 +186,8 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
             "the job",
             found=f"more than {minutes:g} min since it began",
             expected="its end within max_duration_min",
-            remedy="the axes were commanded to stop; the next job resumes the session; raise max_duration_min, or "
-            "see what takes so long in its log",
+            remedy="the axes were commanded to stop, and the next job continues the session; find in the log what "
+            "takes so long, or raise max_duration_min",
         )
 
     @contextmanager

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from daq.config.cell import Cell
 from daq.config.policy import AppliedBy, Permission
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import JobHeld
 from daq.workflow.interlock import Runner
-from daq.writeback.file_target import FileEdit
 from daq.writeback.target import Proposal
 
 NOTHING = "none"  #: Argument of the mount command for a run without load
@@ -57,7 +56,7 @@ class Operator(Protocol):
             mistake: what was found and what to do.
         """
 
-    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+    def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Decide whether a change that passed all gates is written.
 
         Args:
@@ -116,7 +115,7 @@ class CellPolicy:
         """Yes: the mount command is asked once more."""
         return True
 
-    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+    def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Whether `policy: {apply: {by: job}}` lets the job write; what an operator changed since is left to one."""
         is_of_job = self.cell.apply.by is AppliedBy.JOB
         has_drives = self.cell.controller is not None and bool(self.cell.controller.objects)
@@ -150,6 +149,6 @@ class GivenAnswers:
         """Yes: what it carries is mounted once more."""
         return True
 
-    def approve(self, proposal: Proposal[FileEdit], *, touched: bool) -> bool:
+    def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Approve what was approved beforehand, unless the file was changed since."""
         return self.writes and not touched

@@ -40,18 +40,43 @@ def on_flange(run: PlannedRun | Block) -> str:
     return f"{run.payload.upper()} ({run.mass_kg:g} kg) on the flange"
 
 
+def goes_on_with(state: GuidedState) -> str:
+    """Say what the same command does next in a session that an error has ended."""
+    recorded = {run.name for run in state.runs}
+    waiting = [block.name for block in state.blocks if block.name not in recorded]
+    if waiting:
+        return f"it records {waiting[0]} again, which does not count yet"
+    if not state.complete:
+        return "it goes on with the next block"
+    if state.outcome is Outcome.APPLIED and state.acceptance is None:
+        return "it goes on with the moves that accept the gains, and writes nothing again"
+    if state.outcome is not None and state.outcome.good:
+        return "it makes the certificate again, and moves and writes nothing"
+    return "it records nothing again, and goes on with the identification"
+
+
 def position_of(state: GuidedState) -> Position:
     """Find the stage that a session is in, by what its state has and lacks."""
     if state.outcome is not None and state.is_over:
         return Position(StageName.ENDED, f"nothing: the session has ended, {state.outcome.value}")
+    recording = _recording_position(state)
+    if recording is not None:
+        return recording
+    if state.outcome is Outcome.APPLIED and state.acceptance is None:
+        return Position(StageName.ACCEPT, f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new")
+    if state.outcome is not None and state.outcome.good:
+        return Position(StageName.ACCEPT, "nothing: the certificate is being made")
+    if state.decision is None:
+        return Position(StageName.IDENTIFY, "nothing: the gains are being identified")
+    return Position(StageName.WRITE, "look at the change, and type yes in the terminal to write it")
+
+
+def _recording_position(state: GuidedState) -> Position | None:
+    """Find the block that a session is at; None behind the recording."""
     recorded = {run.name for run in state.runs}
     waiting = [block for block in state.blocks if block.name not in recorded]
     if waiting:
         return Position(StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}")
     if not state.complete:
         return Position(StageName.RECORD, "nothing yet: the next block is being prepared")
-    if state.outcome is Outcome.APPLIED:
-        return Position(StageName.ACCEPT, f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new")
-    if state.decision is None:
-        return Position(StageName.IDENTIFY, "nothing: the gains are being identified")
-    return Position(StageName.WRITE, "look at the change, and type yes in the terminal to write it")
+    return None

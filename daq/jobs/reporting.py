@@ -19,6 +19,7 @@ from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import SessionContext
 from daq.jobs.journal import Level
+from daq.jobs.position import goes_on_with
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
@@ -110,15 +111,15 @@ def _report(
     except (AuditUnusable, OutputFailed) as error:
         context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
         unwritten = error
-    session = sessions.save(Session(session.folder, state))
+    session = Session(session.folder, state)
     conclusion = Conclusion(outcome, int(code), session, remark)
     level = Level.NOTICE if outcome.good else Level.ERROR
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
-    with writing(session.folder):
-        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        is_guided = isinstance(session.state, GuidedState)
-        report = session_report(conclusion, context.file) if is_guided else conclusion_report(conclusion, context.file)
-        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
+    try:
+        _write_summary(conclusion, session, context.file)
+    finally:
+        # Last: a session that is over has its summary, also after a kill.
+        sessions.save(session)
     found = sessions.sessions(context.settings.folder, context.cell.name)
     if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -133,6 +134,19 @@ def _report(
     if unwritten is not None:
         raise unwritten
     return conclusion
+
+
+def _write_summary(conclusion: Conclusion, session: Session, cell_file: Path) -> None:
+    """Write the summary as text and as JSON.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    is_guided = isinstance(session.state, GuidedState)
+    report = session_report(conclusion, cell_file) if is_guided else conclusion_report(conclusion, cell_file)
+    with writing(session.folder):
+        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, cell_file).encode())
+        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
 
 
 def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
@@ -188,7 +202,7 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
     if session is not None:
         state = session.state
         lines += [
-            f"Session {state.session} of cell {state.cell}, begun {state.began}, job {state.attempt} of it.",
+            f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt {state.attempt}.",
             *(
                 f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
                 f"recording{'s' * (run.attempts != 1)}"
@@ -203,8 +217,8 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                 change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
                 drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
                 lines.append(
-                    f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} "
-                    f"{gain.unit} found{change}{drift}{': differs' if gain.differs else ''}"
+                    f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± {gain.new_std:.2g} "
+                    f"{gain.unit}{change}{drift}{': differs' if gain.differs else ''}"
                 )
         if isinstance(state, GuidedState):
             lines += _guided_lines(state)
@@ -242,37 +256,66 @@ def _guided_lines(state: GuidedState) -> list[str]:
     lines: list[str] = []
     if state.missing:
         lines += ["", f"Not reached: {state.missing}"]
+    if state.would_help:
+        lines += ["What would help:", *(f"  {line}" for line in state.would_help)]
     if state.acceptance is not None:
-        verdict = "accepted" if state.acceptance.accepted else "NOT ACCEPTED"
-        lines += ["", f"New moves: {verdict}: {state.acceptance.remark}"]
+        verdict = "Accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        lines += ["", f"{verdict} on new moves: {state.acceptance.remark}."]
     return lines
+
+
+def undo_command(cell_file: Path, *, in_drives: bool) -> str:
+    """Return the command that undoes a write to the controller's file, or to the drives."""
+    command = f"drivegain rollback {shlex.quote(str(cell_file.absolute()))}"
+    if in_drives:
+        command += " --drives --yes"
+    return command
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps for the operator, a line each."""
     session = conclusion.session
     outcome = conclusion.outcome
-    if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
+    target = None if session is None else session.state.target
+    undo = undo_command(cell_file, in_drives=target is not None and target.in_drives)
+    if outcome is Outcome.APPLIED and session is not None and _is_contradicted(session.state):
+        return [
+            f"undo the write: {undo}",
+            "compare the controller's numbers and the payload with the certificate, then calibrate again",
+        ]
+    if outcome is Outcome.PROPOSED and session is not None and target is not None:
         calibration = shlex.quote(str(session.folder / CALIBRATION))
         cell = shlex.quote(str(cell_file.absolute()))
         sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
+        command = f"drivegain apply {cell} {calibration}"
+        if target.in_drives:
+            command += " --drives"
         return [
-            *([sign] if session.state.target.unsigned else []),
-            f"drivegain apply {cell} {calibration}",
-            "check the change, and if it is right, write it:",
-            f"drivegain apply {cell} {calibration} --yes --base {session.state.target.looked_at}",
+            *([sign] if target.unsigned else []),
+            command,
+            "if the change that it shows is right, write it:",
+            f"{command} --yes --base {target.looked_at}",
         ]
-    if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
-        return [
-            "let the controller load the file",
-            f"to undo it: drivegain rollback {shlex.quote(str(cell_file.absolute()))}",
-        ]
+    if outcome is Outcome.APPLIED and target is not None:
+        loading = [] if target.in_drives else ["let the controller load the file"]
+        return [*loading, f"to undo it: {undo}"]
+    is_to_go_on = outcome in (Outcome.STOPPED, Outcome.INTERRUPTED)
+    if is_to_go_on and session is not None and isinstance(session.state, GuidedState):
+        return [f"remove the cause, then start the same command: {goes_on_with(session.state)}"]
     return {
-        Outcome.REFUSED: ["see which check failed; the next job records anew"],
-        Outcome.UNFIT: ["see what is wrong with the recordings (`drivegain info LOG`); the next job records anew"],
-        Outcome.STOPPED: ["remove the cause; the next job resumes this session while it is recent"],
-        Outcome.INTERRUPTED: ["nothing, or run the job again: it resumes this session while it is recent"],
+        Outcome.REFUSED: ["find out why the check failed; the same command then begins a new session"],
+        Outcome.UNFIT: [
+            "find out what is wrong with the recordings (`drivegain info LOG`); the same command then begins a new "
+            "session"
+        ],
+        Outcome.STOPPED: ["remove the cause; the same command continues this session while it is recent"],
+        Outcome.INTERRUPTED: ["nothing, or the same command again: it continues this session while it is recent"],
     }.get(outcome, ["nothing"])
+
+
+def _is_contradicted(state: SessionState) -> bool:
+    """Whether new moves contradict the gains that were written."""
+    return isinstance(state, GuidedState) and state.acceptance is not None and not state.acceptance.accepted
 
 
 PREFIX = "drivegain_recalibration_"
@@ -338,8 +381,8 @@ def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: 
         for watched in state.watched:
             alarm.labels(cell, watched.axis).set(float(bool(watched.alarm)))
     if state.decision is not None:
-        drift = gauge("gain_drift_sigma", "Change from the gain in the controller, in σ of the change.", "axis")
-        in_force = gauge("gain_in_force", "In the controller when the job looked, in Nm or N per A.", "axis", "unit")
+        drift = gauge("gain_drift_sigma", "Change from the current gain, in σ of the change.", "axis")
+        in_force = gauge("gain_in_force", "Current gain when the job looked, in Nm or N per A.", "axis", "unit")
         for gain in state.decision.gains:
             in_force.labels(cell, gain.axis, gain.unit).set(gain.old)
             if gain.drift_sigma is not None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from daq.documents.session_state import GuidedState, SessionState
+from daq.documents.session_state import GuidedState, JobState, SessionState
 from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
@@ -24,7 +24,7 @@ STATE = "state.json"
 CALIBRATION = "calibration.yaml"
 REPORT = "report"
 LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
-_ANY_STATE: TypeAdapter[SessionState | GuidedState] = TypeAdapter(SessionState | GuidedState)
+_ANY_STATE: TypeAdapter[JobState | GuidedState] = TypeAdapter(JobState | GuidedState)
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 _REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
@@ -113,7 +113,7 @@ class Basis:
     plans_sha256: str
 
 
-def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = SessionState) -> Session:
+def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = JobState) -> Session:
     """Begin a session: make its folder and write its state.
 
     Args:
@@ -182,12 +182,12 @@ def last_good(found: tuple[Session, ...]) -> Session | None:
 
 
 def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:
-    """Remove old sessions, except the last good one and those whose gains a controller has.
+    """Remove old sessions, except the last good one and those whose calibration is in force.
 
     Args:
         found: oldest first.
         keep: number of the newest sessions to keep.
-        in_force: digests of the calibrations whose gains a controller has: their logs and signatures are its evidence.
+        in_force: digests of the calibrations in force: their logs and signatures are the evidence for current gains.
 
     Returns:
         folders that were removed; one that the file system does not release is skipped.

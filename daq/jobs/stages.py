@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from daq.documents.session_state import WatchedGain
-from daq.errors import CalibrationUnreadable
+from daq.errors import CalibrationUnreadable, OutputFailed
 from daq.files import sha256_of
 from daq.jobs.context import SessionContext, before_motion
 from daq.jobs.decision import decide_outcome
@@ -19,6 +19,7 @@ from daq.jobs.recording import calibration_of_session, fit_session, record_runs,
 from daq.jobs.session import CALIBRATION, Session
 from daq.ledger.ledger import MAY_LACK, enter_calibration, read_history
 from daq.ledger.watch import alarm_text, watch
+from daq.report.certificate import status_text
 from ident.calibration import Calibration
 
 
@@ -78,7 +79,7 @@ class WatchDrift:
 
 
 class Decide:
-    """Compare the gains with those in the controller, and write them where the operator approves."""
+    """Compare the gains with the current ones, and write them where the operator approves."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
         """See `daq.jobs.decision.decide_outcome`."""
@@ -86,8 +87,30 @@ class Decide:
         return decide_outcome(context.within("decide"), session, calibration_made(session), history)
 
 
+class Certify:
+    """Make the certificate again: who wrote the gains and when, and whether new moves accept them."""
+
+    def run(self, context: SessionContext, session: Session) -> Session:
+        """Write the page; where the file system refuses, the session ends all the same: its gains are what counts."""
+        journal = context.within("certify").journal
+        calibration = calibration_made(session)
+        now = context.tools.now()
+        try:
+            certificate = context.tools.certify(context.file, context.cell, calibration, session.folder, now)
+        except OutputFailed as error:
+            calibration_file = session.folder / CALIBRATION
+            remedy = f"`drivegain certificate {calibration_file} --cell {context.file}` makes another"
+            journal.say(Level.WARNING, "the certificate is that of before the decision", text=f"{error}; {remedy}")
+            return session
+        status = status_text(certificate.comparison)
+        journal.say(Level.NOTICE, "certified", id=certificate.origin.id, text=status)
+        return session
+
+
 TO_DECISION: tuple[Stage, ...] = (Record(), Identify(), WatchDrift(), Decide())
-"""Stages of the scheduled job and of the demonstration; a guided session goes on with the acceptance."""
+"""Stages that job, guided session and demonstration share."""
+OF_JOB: tuple[Stage, ...] = (*TO_DECISION, Certify())
+"""Stages of the scheduled job."""
 
 
 def run_stages(stages: Sequence[Stage], context: SessionContext, session: Session) -> Session:

@@ -63,12 +63,48 @@ def _gains(fields: Fields) -> str:
     target = f"{worst['target_percent']:g} %"
     left_s = fields["left_s"]
     if left_s > 0.0:
+        why = f" ({worst['cause']})" if worst.get("cause") else ""
         lines.append(
-            f"The target is ± {target}. {worst['axis']} needs the longest: about {left_s:.0f} s more, if σ falls with "
-            "the root of the time."
+            f"The target is ± {target}. {worst['axis']} needs the longest{why}: about {duration(left_s)} more at this "
+            "rate."
         )
     else:
         lines.append(f"Every gain is within ± {target}: the recording is complete.")
+    return "\n".join(lines)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration of motion in words: seconds up to two minutes, then minutes."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min"
+
+
+def _quick(fields: Fields) -> str:
+    """Return the quick estimate after a move in one line, the worst gain first; before there is one, what it lacks."""
+    if fields["missing"]:
+        return f"No gains yet: {fields['missing']}."
+    gains = fields["gains"]
+    listed = ", ".join(_beside_target(gain) for gain in gains)
+    if fields["is_held_out"]:
+        return f"This block is held out: its moves do not count. Quick estimate so far, gain ± σ (target): {listed}."
+    head = f"Quick estimate after move {fields['move']} of {fields['moves']}, gain ± σ (target): {listed}."
+    left_s = fields["left_s"]
+    if left_s <= 0.0:
+        return f"{head} All are at the target; the estimate at the end of the block decides."
+    return f"{head} {gains[0]['axis']} is worst ({fields['why']}): about {duration(left_s)} left at this rate."
+
+
+def _beside_target(gain: Fields) -> str:
+    """Return a gain ± σ with its target in brackets."""
+    value = f"{gain['axis']} {gain['value']:.4g} {gain['unit']}"
+    return f"{value} ± {gain['std_percent']:.2f} % ({gain['target_percent']:g} %)"
+
+
+def _time_is_up(fields: Fields) -> str:
+    """Return what was not reached in the time, and what would help."""
+    lines = ["", f"The time is up. Not reached: {fields['missing']}.", "What would help:"]
+    lines += [f"  {line}" for line in fields["would_help"]]
     return "\n".join(lines)
 
 
@@ -86,34 +122,37 @@ def _identifying(fields: Fields) -> str:
 PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
     "recorded": _recorded,
     "gains so far": _gains,
+    "quick estimate": _quick,
+    "time is up": _time_is_up,
     "identifying": _identifying,
 }
 """What a person reads of an event where that is more than a sentence with its fields."""
 
 SENTENCES = {
     "session begun": "A new session begins. Its files are in {folder}.",
-    "session taken up": "The session goes on where it was. Recorded already: {recorded}.",
-    "an unfinished session is not taken up": "! The unfinished session in {folder} is left as it is: {reason}.",
+    "session taken up": "The session continues. Already recorded: {recorded}.",
+    "an unfinished session is not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
     "the interlock lets the robot move": "Checked: disk, history and interlock.",
     "drives are as declared, without fault and without power": "Checked: the drives.",
-    "moves to look at": "\nThe moves of {run}, to look at first: {page}",
+    "moves to look at": "\nLook at the moves of {run} first: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
-    "recording is invalid": "! This recording cannot be used ({reason}); it is kept, and the block is recorded again.",
-    "set aside": "The earlier recording is kept as {log}.",
+    "recording is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is recorded again.",
+    "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",
     "weighed": "The moves show about {added_kg:.2g} kg more on the flange than without load.",
     "mistake in a block": "\n! {text}",
-    "kept as it is": "{block} is kept as it is.",
+    "kept as it is": "{block} is used as it is.",
     "the blocks so far do not give the gains": "\n! The blocks so far give no gains: {text}",
     "found": "  {text}",
     "certificate": "Certificate: {page}",
     "drift": "! {axis}: {text}",
-    "compared with the gains in the controller": "\nBeside the gains in the controller: {words}.",
+    "compared with the gains in the controller": "\nCompared with the current gains, {words}.",
     "a check failed": "✗ {text}",
-    "written to the controller's file": "Written to {file}. The content before is in {backup}.",
+    "written to the controller's file": "Written to {file}. The previous content is in {backup}.",
     "proposed: an operator has to apply it": "Nothing was written.",
     "session ended": "",  # the end of the session or the error follows
     "accepted": "✓ Accepted: {text}.",
-    "not accepted": "✗ Not accepted: {text}.",
+    "not accepted": "✗ Not accepted: {text}. To undo the write: {undo}",
+    "certified": "Certificate {id}: {text}.",
 }
 """The sentence of each event, with its fields."""

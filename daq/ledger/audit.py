@@ -50,6 +50,8 @@ class AuditAction(Enum):
     RECALIBRATION_ENDED = "recalibration ended"
     ACCEPTED = "accepted"
     """A calibration was tried in the cell and accepted; details: cell, session, SHA-256 of the calibration's file."""
+    NOT_ACCEPTED = "not accepted"
+    """A calibration was tried in the cell, and new moves contradict it; details as of ACCEPTED, and how to undo it."""
     ACKNOWLEDGED = "acknowledged"
     CALIBRATION_ENTERED = "calibration entered"
     """The history has this calibration; details: SHA-256 of its file, cell, time, document, and its figures."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any
 from daq.config.cell import Cell
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
+from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
 from ident.calibration import Calibration, Gain, Source
 
@@ -56,6 +56,7 @@ class Entry:
     rows: int  #: of the observation
     gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
     events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
+    acceptance: RecordedAcceptance | None = None  #: result of the last new moves with its gains; None without any
 
     def gain_of(self, axis: str) -> Gain | None:
         """Return the gain of an axis, None for an axis that it does not have."""
@@ -79,6 +80,19 @@ class Acknowledgement:
     audit: str  #: SHA-256 of its entry in the audit log
 
 
+@dataclass(frozen=True, slots=True)
+class RecordedAcceptance:
+    """Result of new moves that a cell made with written gains."""
+
+    digest: str  #: SHA-256 of the calibration's file
+    accepted: bool  #: whether the torques of these moves agree with the gains
+    at: datetime  #: when, UTC
+    who: str  #: the person or the session
+    log_sha256: str | None  #: of the log of these moves; None where the audit log does not say
+    remark: str  #: what was found, in words; may be empty
+    undo: str  #: command that undoes the write; empty where they were accepted
+
+
 def drives_of(cell: str) -> str:
     """Return the name of a cell's drives in audit and history."""
     return f"drives of cell {cell}"
@@ -96,7 +110,7 @@ def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
 def logs_of(calibration: Calibration, digest: str) -> str:
     """Return the digest of the set of logs of a fit; that of the calibration itself without logs."""
     logs = sorted({one.sha256 for one in _fitted(calibration)})
-    return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
+    return sha256("\n".join(logs).encode()) if logs else digest
 
 
 def _fitted(calibration: Calibration) -> list[Source]:
@@ -193,6 +207,7 @@ class History:
     entries: tuple[Entry, ...]  #: calibrations in the order in which they were fitted
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: explained changes, oldest first
+    acceptances: tuple[RecordedAcceptance, ...] = ()  #: runs of new moves after a write, oldest first
     unreadable: tuple[str, ...] = ()  #: calibrations of the audit log that cannot be read, as sentences
     may_lack: bool = False  #: whether the audit log is not what was written, so that something may be missing here
 
@@ -253,12 +268,15 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     by_digest: dict[str | None, list[Event]] = {}
     for event in events:
         by_digest.setdefault(event.digest, []).append(event)
+    acceptances = tuple(acceptances_of(entries, cell.name))
+    accepted = {one.digest: one for one in acceptances}  # the last one of each calibration
     found: list[Entry] = []
     unreadable: list[str] = []
     for one in entered_calibrations(entries, cell.name):
         try:
             figures = one.figures or figures_of_document(one)
-            found.append(entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ())))
+            entry = entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ()))
+            found.append(replace(entry, acceptance=accepted.get(one.digest)))
         except DaqError as error:
             unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
         except (KeyError, TypeError, ValueError) as error:
@@ -269,6 +287,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
         acknowledgements=tuple(acknowledgements_of(entries, cell.name)),
+        acceptances=acceptances,
         unreadable=tuple(unreadable),
     )
 
@@ -354,6 +373,33 @@ def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     if not _NEVER < since <= at:
         return None
     return Acknowledgement(axis, since, at, entry.who, why, entry.sha256)
+
+
+def acceptances_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[RecordedAcceptance]:
+    """Yield the results of new moves with written gains in a cell, oldest first."""
+    for entry in entries:
+        found = _acceptance_of(entry)
+        if found is not None and text_field(entry, "cell") == cell:
+            yield found
+
+
+def _acceptance_of(entry: AuditEntry) -> RecordedAcceptance | None:
+    """Return the acceptance of an entry; None where it is another entry, or lacks a part."""
+    if entry.action not in {AuditAction.ACCEPTED, AuditAction.NOT_ACCEPTED}:
+        return None
+    at = at_of(entry)
+    digest = text_field(entry, "calibration_sha256")
+    if at is None or digest is None:
+        return None
+    return RecordedAcceptance(
+        digest=digest,
+        accepted=entry.action is AuditAction.ACCEPTED,
+        at=at,
+        who=entry.who,
+        log_sha256=text_field(entry, "log_sha256"),
+        remark=text_field(entry, "remark") or "",
+        undo=text_field(entry, "undo") or "",
+    )
 
 
 def is_end(entry: AuditEntry) -> bool:

@@ -8,9 +8,11 @@ first command that enters or shows the history (`migrate`).
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from enum import Enum
 from pathlib import Path
 
 from daq.config.cell import Cell
@@ -23,6 +25,7 @@ from daq.ledger.audit import (
     AuditVerdict,
     Flaw,
     append,
+    begun_by,
     entry_after,
     head_file,
     noted_heads,
@@ -31,7 +34,9 @@ from daq.ledger.audit import (
 from daq.ledger.fold import (
     AuditedWrite,
     Entry,
+    Event,
     History,
+    RecordedAcceptance,
     at_of,
     entered_calibrations,
     figures_of,
@@ -73,6 +78,7 @@ SESSIONS = frozenset(
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.RECALIBRATION_ENDED,
         AuditAction.ACCEPTED,
+        AuditAction.NOT_ACCEPTED,
     }
 )
 """What `record_session` enters."""
@@ -448,3 +454,115 @@ def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[En
         remedy="gains are compared over time only where they mean the same: begin another audit log "
         "(`history.audit` of the cell file); nothing was entered",
     )
+
+
+class StandingState(Enum):
+    """States of a calibration."""
+
+    NOT_KNOWN = "not known"  #: no ledger was read
+    NOT_WRITTEN = "not written"
+    WRITTEN = "written"  #: a controller has its gains
+    ACCEPTED = "accepted"  #: it was tried in the cell, and accepted
+    NOT_ACCEPTED = "not accepted"  #: it was tried in the cell, and new moves contradict it
+    REPLACED = "replaced"  #: its gains were written, and were replaced or rolled back since
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """State of one calibration at one time."""
+
+    as_of: datetime | None  #: when the ledger was read, with zone; None where it was not
+    unknown: str = ""  #: why it was not, in words; empty where it was
+    write: Event | None = None  #: last write of its gains, one that is in force if there is any; None if never written
+    #: Next write or rollback at the same place; None while the gains are in force.
+    ended: Event | None = None
+    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have them.
+    before: Mapping[str, float] = field(default_factory=dict)
+    acceptance: RecordedAcceptance | None = None  #: result of the last new moves with these gains
+    history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
+
+    @property
+    def state(self) -> StandingState:
+        """State in one word."""
+        if self.as_of is None:
+            return StandingState.NOT_KNOWN
+        if self.ended is not None:
+            return StandingState.REPLACED
+        if self.acceptance is not None and not self.acceptance.accepted:
+            return StandingState.NOT_ACCEPTED
+        if self.acceptance is not None:
+            return StandingState.ACCEPTED
+        if self.write is not None:
+            return StandingState.WRITTEN
+        return StandingState.NOT_WRITTEN
+
+
+def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | None = None) -> Standing:
+    """Read the state of a calibration from the ledger of its cell.
+
+    Args:
+        ledger: of the cell.
+        digest: SHA-256 of the calibration's file.
+        as_of: time now, with zone.
+        place: controller's file, whose write counts before others where it is in force; None for any place.
+
+    Raises:
+        AuditUnusable: the audit log is no regular file, or it cannot be read.
+        HistoryUnreadable: there is a history of an earlier version that cannot be read.
+    """
+    history = read_history(ledger)
+    # Entries that were edited prove nothing.
+    entries = verify(ledger.audit, noted_heads(ledger.audit)).intact
+    write = _last_write(history, digest, place)
+    acceptances = [one for one in history.acceptances if one.digest == digest]
+    before: dict[str, float] = {}
+    ended: Event | None = None
+    if write is not None:
+        before = _gains_before(write, entries)
+        ended = _next_at_its_place(history, write)
+    return Standing(
+        as_of=as_of,
+        write=write,
+        ended=ended,
+        before=before,
+        acceptance=acceptances[-1] if acceptances else None,
+        history=history,
+    )
+
+
+def _last_write(history: History, digest: str, place: str | None) -> Event | None:
+    """Return the last write of a calibration's gains, one that is in force if there is any, and `place` first."""
+    newest = {event.target: event for event in history.events}
+    in_force = [event for event in newest.values() if event.digest == digest]
+    here = [event for event in in_force if event.target == place]
+    writes = here or in_force or [event for event in history.events if event.digest == digest]
+    return max(writes, key=lambda event: event.at, default=None)
+
+
+def _next_at_its_place(history: History, write: Event) -> Event | None:
+    """Return the write or rollback that followed a write at the same place; None where there was none."""
+    later = history.events[history.events.index(write) + 1 :]
+    return next((event for event in later if event.target == write.target), None)
+
+
+def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, float]:
+    """Return the previous gains, those before a write, by axis; none where the audit log lacks them."""
+    by_digest = {entry.sha256: entry for entry in entries}
+    by_number = {entry.number: entry for entry in entries}
+    ended = by_digest.get(write.audit or "")
+    if ended is None:
+        return {}
+    # The end names the begin, which has the numbers; a write that its killed writer did not end is the begin itself.
+    begun = by_number.get(begun_by(ended), ended)
+    changes = begun.details.get("changes")
+    if not isinstance(changes, list):
+        return {}
+    before = {}
+    for change in changes:
+        if not isinstance(change, dict):
+            continue
+        axis = change.get("axis")
+        old = change.get("old")
+        if isinstance(axis, str) and isinstance(old, float | int) and math.isfinite(old):
+            before[axis] = float(old)
+    return before

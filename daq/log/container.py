@@ -25,8 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
-from daq.config.document_kind import IN_ORDER
-from daq.config.yaml_file import kind_of_file
+from daq.config.yaml_file import IN_ORDER, kind_of_file
 from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated, reason_of
 from daq.files import open_regular
 from daq.log.message import (

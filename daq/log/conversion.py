@@ -194,8 +194,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         raise fault
     scale = scaling(cell, log.head.readback)
     position_rad = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
-    bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
-    limited = samples.statusword & np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16) != 0
+    limited = limit_active(cell, samples.statusword)
     share = limited.mean(axis=0)
     worst = int(np.argmax(share))
     largest_percent = 100.0 * LARGEST_SATURATED
@@ -244,6 +243,15 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
 
         require_explained_currents(converted, model_of(cell), cell.conditioning, cell.axis_names)
     return converted
+
+
+def limit_active(cell: Cell, statusword: NDArray[np.uint16]) -> BoolArray:
+    """Return whether a limit of each axis's current was active, shape (k, n), from its statuswords, shape (k, n)."""
+    masks = []
+    for axis in cell.axes:
+        bit = None if axis.profile is None else axis.profile.saturation_bit
+        masks.append(0 if bit is None else 1 << bit)
+    return np.asarray(statusword & np.array(masks, dtype=np.uint16) != 0, dtype=np.bool_)
 
 
 def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:

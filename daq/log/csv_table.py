@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import math
 import re
 from array import array
@@ -19,7 +18,7 @@ import numpy as np
 
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
-from daq.files import read_regular
+from daq.files import read_regular, sha256
 from daq.log.table import Stamps, Table, check_reach, repeated, stamps_of_ns, stamps_of_numbers, unreadable
 from ident.arrays import FloatArray
 
@@ -42,7 +41,7 @@ def read_csv(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     stamps = None
     if time is not None:
         stamps = _dates(lines, time) if dated else _stamps(lines, time, values[:, -1])
-    digest = hashlib.sha256("\n".join(lines.rows).encode()).hexdigest()
+    digest = sha256("\n".join(lines.rows).encode())
     return Table(path, columns, values[:, : len(columns)], digest, stamps, lines.first_line, remarks)
 
 

@@ -9,7 +9,6 @@ file and end with the process. Only processes of the same user, or of root, are 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import selectors
@@ -30,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from daq.files import sha256
 from daq.log.conversion import SiScaling
 from daq.log.metadata import RunStatistics
 from drivers.errors import POWERED, WHILE, stop_notes, text_of
@@ -46,7 +46,7 @@ LARGEST_PACKET = 1 << 18  #: [bytes]
 LARGEST_CONSOLES = 8  #: Served at the same time, and clients of the stop that have not asked yet
 
 SAMPLES, TEXT = 0, 1
-"""Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, result and end."""
+"""Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, quick, result and end."""
 HEAD = struct.Struct("<BQQIIH")
 """Kind; number of the packet; of the run so far its samples, lost cycles and missing answers; samples in the packet."""
 
@@ -96,12 +96,44 @@ class ProgramEnd:
 
 
 @dataclass(frozen=True, slots=True)
+class QuickGain:
+    """Quick estimate of a gain, beside its target."""
+
+    axis: str
+    unit: str
+    value: float
+    std_percent: float
+    target_percent: float
+
+    @property
+    def ratio(self) -> float:
+        """Return σ over its target."""
+        return self.std_percent / self.target_percent
+
+
+@dataclass(frozen=True, slots=True)
+class QuickLook:
+    """What a quick linear estimate says of the gains after a move. It is for the eye and decides nothing."""
+
+    block: str  #: that is being recorded
+    move: int  #: finished moves of the block
+    moves: int  #: in its plan
+    motion_s: float  #: motion that the estimate is made from [s]
+    is_held_out: bool = False  #: the moves of this block do not count
+    gains: list[QuickGain] = field(default_factory=list)  #: the worst first; empty where nothing is known yet
+    missing: str = ""  #: why nothing is known yet
+    why: str = ""  #: why the worst gain takes longest
+    left_s: float = 0.0  #: motion until every gain is at its target, if σ falls as 1/√time [s]
+
+
+@dataclass(frozen=True, slots=True)
 class Message:
     """The JSON object of a packet."""
 
     run: RunFacts | None = None
     events: list[CellEvent] = field(default_factory=list)
     bus_load: dict[str, float] | None = None
+    quick: QuickLook | None = None
     result: RunResult | None = None
     end: ProgramEnd | None = None
 
@@ -170,7 +202,7 @@ class SocketNames:
 
 def socket_names(cell_file: Path) -> SocketNames:
     """Return the addresses for a cell file."""
-    digest = hashlib.sha256(str(cell_file.resolve()).encode()).hexdigest()[:24]
+    digest = sha256(str(cell_file.resolve()).encode())[:24]
     return SocketNames(*(f"\0drivegain-{digest}-{name}" for name in ("feed", "stop", "monitor")))
 
 
@@ -255,6 +287,8 @@ class Feed:
         self._statistics: Callable[[], RunStatistics] = lambda: RunStatistics(0, 0, (), valid=False)
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self._result: dict[str, Any] | None = None
+        self._looks: deque[QuickLook] = deque(maxlen=1)  # of another thread; the newest is enough
+        self._quick: dict[str, Any] | None = None
         self._packed: list[bytes] = []
         self._layout, self._batch = packet_struct(0), 1
         self._waiter: threading.Thread | None = None
@@ -302,6 +336,8 @@ class Feed:
         self._run, self._statistics, self._result = run, statistics, None
         self._layout, self._batch = packet_struct(len(run.axes)), max(1, round(BATCH_S * run.rate_hz))
         self._events.clear()
+        self._looks.clear()
+        self._quick = None
         self._send({"run": asdict(run)})
 
     def sample(self, sample: Sample) -> None:
@@ -332,6 +368,10 @@ class Feed:
         """Publish the load that a monitor has measured on each bus, as a share, with the longest bit stuffing."""
         self._send({"bus_load": bus_load})
 
+    def look(self, look: QuickLook) -> None:
+        """Publish a look at the gains, with the next samples. Any thread may call this."""
+        self._looks.append(look)
+
     def finish(self) -> None:
         """Publish the result of the run, whose log is complete."""
         self._flush()
@@ -340,10 +380,17 @@ class Feed:
         self._send({"result": self._result})
 
     def _flush(self) -> None:
+        self._publish_look()
         if not self._packed:
             return
         packed, self._packed = self._packed, []
         self._send_to_all(SAMPLES, b"".join(packed), len(packed))
+
+    def _publish_look(self) -> None:
+        """Send the newest look, if there is one; the thread that sends all packets calls this."""
+        with suppress(IndexError):
+            self._quick = asdict(self._looks.pop())
+            self._send({"quick": self._quick})
 
     def _send(self, message: dict[str, Any]) -> None:
         self._send_to_all(TEXT, json.dumps(message).encode(), 0)
@@ -357,7 +404,12 @@ class Feed:
             fresh = self._new.popleft()
             self._consoles.append(fresh)
             if self._run is not None:
-                past = {"run": asdict(self._run), "events": list(self._events), "result": self._result}
+                past = {
+                    "run": asdict(self._run),
+                    "events": list(self._events),
+                    "quick": self._quick,
+                    "result": self._result,
+                }
                 self._put(fresh, self._head(TEXT, 0) + json.dumps(past).encode())
         self._number += 1
         packet = self._head(kind, samples) + content if self._consoles else b""

@@ -383,7 +383,6 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
     position = watched.position[number]
     ampere_per_unit = watched.ampere[number]
     raw = axis.current_raw
-    in_fault = axis.statusword is not None and decode(axis.statusword) in FAULTY
     # While another master prepares, it sends no SYNC, and no axis has to answer.
     addressed = watched.reading.source.value == "asked" or watched.reading.sync_hz > 0.0
     predicted = () if watched.prediction is None else watched.prediction.axes
@@ -395,12 +394,11 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
         unit=declared.unit.name,
         current_a=None if raw is None or ampere_per_unit is None else raw * ampere_per_unit,
         **_state(axis.statusword),
-        in_fault=in_fault,
         nmt=None if axis.nmt is None else nmt_name(axis.nmt),
         silent=addressed and not axis.heard,
         refused=[RefusedObject.of(one, object=str(one.entry)) for one in axis.refused],
         remark="; ".join(_answer_remarks(axis)),
-        fault=watched.faults.get(declared.name) if in_fault else None,
+        fault=watched.faults.get(declared.name) if axis.in_fault else None,
         prediction=predicted[number] if predicted else None,
     )
 

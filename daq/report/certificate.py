@@ -1,39 +1,45 @@
-"""The certificate of a calibration: its gains beside those in the controller, the limits, and one verdict.
+"""The certificate of a calibration: its gains beside the current ones, the limits, and one verdict.
 
 The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from enum import Enum
+from pathlib import Path
 from typing import Literal
 
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused
 from daq.files import sha256
-from daq.ledger.fold import Event
-from daq.report.certificate_status import CertificateStatus, certificate_status, write_text
+from daq.ledger.fold import Event, RecordedAcceptance, WriteAction
+from daq.ledger.ledger import MAY_LACK, StandingState
 from daq.report.comparison import OPERATORS, Comparison, before_write, changes_from
 from daq.report.document import Figure, Report
 from daq.report.effect_names import accepted_text, size_text
 from daq.report.fit import Errors
-from daq.report.identity import identity
+from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import Refused
+from daq.report.text import minute_text
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
-from daq.writeback.request import GainChange
+from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
+from ident.data.run import Recording
 
 
 class CertifiedGain(Report):
-    """A gain beside the one in the controller, or beside the nameplate."""
+    """A gain beside the current one, or beside the nameplate."""
 
     axis: str
     key: str | None
     """in the controller's file; null where it was not read"""
     line: int | None
     old: Figure
+    """current gain, or the nameplate where the controller was not read; of `beside`, the earlier calibration's gain"""
     new: Figure
     std: float
     std_percent: Figure
@@ -68,6 +74,47 @@ class EarlierCalibration(Report):
     holdout_error_percent: Errors | None
 
 
+class StatusEvent(Report):
+    """A write, a rollback, or new moves with the gains."""
+
+    at: str
+    who: str
+
+
+class StatusWrite(StatusEvent):
+    """A write, or a rollback that restored these gains."""
+
+    target: str
+    """the controller's file, or the drives"""
+
+
+class StatusAcceptance(StatusEvent):
+    """Result of new moves with these gains."""
+
+    accepted: bool
+    remark: str
+    """what was found"""
+    undo: str
+    """command that undoes the write; empty where they were accepted"""
+
+
+class CertificateStatus(Report):
+    """State of a calibration by the audit log of its cell, and by the controller's file where it was read."""
+
+    state: str
+    """written, accepted, not accepted, replaced, not written, or not known"""
+    text: str
+    """the same as a sentence"""
+    as_of: str | None
+    """when the audit log was read; null where it was not"""
+    write: StatusWrite | None
+    """last write of these gains; null where there was none"""
+    ended: StatusEvent | None
+    """write or rollback that put other gains in their place; null where there was none"""
+    acceptance: StatusAcceptance | None
+    """result of the last new moves with these gains; null where there were none"""
+
+
 class CertificateReport(Report):
     """`certificate`: the numbers of the page."""
 
@@ -97,8 +144,6 @@ class CertificateReport(Report):
     beside: EarlierCalibration | None
 
 
-EARLIER = "earlier calibration"  #: What `since` compares with
-BEFORE = "previous gain"  #: What a written calibration is compared with
 _ID_DIGITS = 12  #: As history and audit log shorten a digest
 
 
@@ -116,16 +161,17 @@ class Verdict(Enum):
 class AxisRow:
     """One gain of the certificate."""
 
-    change: GainChange  #: gain in the controller, or nameplate, and identified one with its σ
+    change: GainChange  #: identified gain with its σ, and the one that it is compared with
     allowed_percent: tuple[float, float]  #: limits of the change
     judged: JudgedChange  #: NaN where it cannot be judged
     refusals: tuple[Refusal, ...]  #: failed checks of this axis
 
-    def words(self, place: str) -> str:
-        """Verdict in words; `place` has the other gain: the controller or the nameplate."""
+    @property
+    def words(self) -> str:
+        """Verdict in words."""
         if self.refusals:
             return "; ".join(f"refused: {refusal.found}" for refusal in self.refusals)
-        return f"differs from the {place}" if self.significant else "same within noise"
+        return f"differs from the {self.change.compared_with.value}" if self.significant else "same within noise"
 
     @property
     def significant(self) -> bool:
@@ -158,8 +204,8 @@ class Certificate:
     calibration: Calibration
     comparison: Comparison
     origin: Origin
-    rows: tuple[AxisRow, ...]  #: change from the controller or the nameplate, one an axis
-    #: Comparison with the gains before the write that is in force; None without one, or where they are not known.
+    rows: tuple[AxisRow, ...]  #: change from the current gain or the nameplate, one an axis
+    #: Comparison with the previous gains, those before the write that is in force; None where there is none of them.
     before: Comparison | None = None
     changed: tuple[AxisRow, ...] = ()  #: change by that write, one an axis; empty without it
     earlier: Calibration | None = None  #: another calibration of the cell to compare with
@@ -167,28 +213,20 @@ class Certificate:
     since: tuple[AxisRow, ...] = ()
 
     @property
-    def place(self) -> str:
-        """Name of the gains that `rows` compares with."""
-        return "nameplate" if self.comparison.edit is None else "current gain"
-
-    @property
     def shown(self) -> tuple[AxisRow, ...]:
         """Change of each gain as the page shows it: by the write, once the gains are written."""
         return self.changed or self.rows
 
     @property
-    def shown_place(self) -> str:
-        """Name of the gains that `shown` compares with."""
-        return self.place if self.before is None else BEFORE
+    def compared_with(self) -> str:
+        """Word for the gains that `shown` compares with, the same on every axis."""
+        return self.shown[0].change.compared_with.value
 
     @property
     def note(self) -> str:
         """Meaning of a difference beyond noise, as `apply` states it."""
-        if self.before is not None:
-            return noise_note(self.before.changes, self.before.known, "the previous gain")
-        comparison = self.comparison
-        old = "the nameplate" if comparison.edit is None else "the number in the controller"
-        return noise_note(comparison.changes, comparison.known, old)
+        comparison = self.before or self.comparison
+        return noise_note(comparison.changes, comparison.known)
 
     @property
     def verdict(self) -> Verdict:
@@ -207,24 +245,32 @@ class Certificate:
         """The verdict in one sentence; of gains that are in force, who has written them."""
         differing = [row for row in self.shown if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
-        furthest = "" if most is None else f"{most.change.axis} by {most.change.change_percent:+.1f} %"
+        furthest = "" if most is None else f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
         total = len(self.shown)
         count = f"all {total} gains" if len(differing) == total else f"{len(differing)} of {total} gains"
         write = self.comparison.in_force
         if write is not None:
-            return self._written_sentence(write, f"{count} changed by more than noise, most {furthest}")
+            return self._written_sentence(write, f"{count} changed by more than noise, {furthest}")
         match self.verdict:
             case Verdict.REFUSED:
                 return f"Must not be written: {self._reason}."
             case Verdict.UNCHANGED:
-                return "Nothing to change: no gain differs from the one in the controller by more than noise."
+                return "Nothing to change: no gain differs from the current gain by more than noise."
             case Verdict.WAITING:
                 remedy = self.comparison.refusals[0].remedy
-                return f"Waits for an operator: {count} change, most {furthest}; {remedy}."
+                return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
-                return f"Ready to be written: {count} change by more than noise, most {furthest}; every check passed."
-        differ = f"{count} differ from the nameplate by more than noise, most {furthest}"
+                return f"Ready to be written: {count} change by more than noise, {furthest}. Every check passed."
+        differ = f"{count} differ from the nameplate by more than noise, {furthest}"
         return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
+
+    @property
+    def contradicted(self) -> str:
+        """What new moves with the written gains have found wrong; empty where nothing is."""
+        acceptance = self.comparison.standing.acceptance
+        if acceptance is None or acceptance.accepted:
+            return ""
+        return acceptance.remark or "the audit log does not say how"
 
     @property
     def _failed(self) -> list[Refusal]:
@@ -246,6 +292,8 @@ class Certificate:
         sentence = f"{text[0].upper()}{text[1:]}"
         if any(row.significant for row in self.changed):
             sentence += f": {changed}"
+        if self.contradicted:
+            sentence += f". New moves contradict them: {self.contradicted}"
         if self._failed:
             sentence += f". Today a check refuses them: {self._reason}"
         return f"{sentence}."
@@ -274,7 +322,8 @@ def certify(
     if earlier is not None:
         _require_whole(earlier)
         _require_same(calibration, earlier)
-        changes = changes_from({gain.axis: gain.value for gain in earlier.gains}, calibration)
+        gains = {gain.axis: gain.value for gain in earlier.gains}
+        changes = changes_from(gains, GainOrigin.EARLIER, calibration)
         known = Spread({gain.axis: gain.std for gain in earlier.gains})
         since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
     origin = origin or Origin.of(calibration)
@@ -338,7 +387,7 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     edit = comparison.edit
     beside = None
     if certificate.earlier is not None:
-        since = [_certified_gain(row, EARLIER) for row in certificate.since]
+        since = [_certified_gain(row) for row in certificate.since]
         beside = EarlierCalibration.of(certificate.earlier, axes=since)
     return CertificateReport.of(
         certificate,
@@ -351,7 +400,7 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         identity=identity(calibration),
         controller=None if edit is None else str(edit.file),
         controller_unread=comparison.unread or None,
-        axes=[_certified_gain(row, certificate.place) for row in certificate.rows],
+        axes=[_certified_gain(row) for row in certificate.rows],
         effects=[
             CertifiedEffect.of(one, effect=accepted_text(one, calibration), size=size_text(one, calibration))
             for one in calibration.effects
@@ -360,14 +409,139 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     )
 
 
-def _certified_gain(row: AxisRow, place: str) -> CertifiedGain:
+def _certified_gain(row: AxisRow) -> CertifiedGain:
     change = row.change
     return CertifiedGain.of(
         change,
         row,
         key=change.key or None,
         line=change.line or None,
+        old=change.compared_gain,
+        nameplate=change.nameplate_gain,
         written=change.spelling or None,
         change_sigmas=row.judged.sigmas,
-        verdict=row.words(place),
+        verdict=row.words,
     )
+
+
+_VERBS = {WriteAction.APPLIED: "written", WriteAction.ROLLED_BACK: "restored by a rollback"}
+_ENDS = {WriteAction.APPLIED: "replaced by other gains", WriteAction.ROLLED_BACK: "rolled back"}
+
+
+def certificate_status(comparison: Comparison) -> CertificateStatus:
+    """Return the status for the document of the certificate."""
+    return CertificateStatus.of(comparison.standing, state=_state(comparison).value, text=status_text(comparison))
+
+
+def _state(comparison: Comparison) -> StandingState:
+    if comparison.changed_by_hand:
+        return StandingState.REPLACED
+    return comparison.standing.state
+
+
+def status_text(comparison: Comparison) -> str:
+    """Return the status in words."""
+    standing = comparison.standing
+    if standing.as_of is None:
+        return f"not known: {standing.unknown}"
+    parts = ["not written"]
+    if standing.write is not None:
+        parts = [write_text(standing.write)]
+    if standing.ended is not None:
+        parts.append(f"{_ENDS[standing.ended.action]} on {_when(standing.ended.at)} by {standing.ended.who}")
+    elif comparison.changed_by_hand:
+        parts.append("the file has other gains now")
+    if standing.acceptance is not None:
+        parts.append(_acceptance_text(standing.acceptance, is_in_place=comparison.in_force is not None))
+    if standing.history.may_lack:
+        parts.append(MAY_LACK)
+    return f"{'; '.join(parts)} (as of {_when(standing.as_of)})"
+
+
+def _acceptance_text(acceptance: RecordedAcceptance, *, is_in_place: bool) -> str:
+    """Say when new moves accepted the gains; otherwise what failed, and how to undo the write if it is in place."""
+    if acceptance.accepted:
+        return f"accepted on {_when(acceptance.at)} by {acceptance.who}"
+    text = f"NOT ACCEPTED on {_when(acceptance.at)} by {acceptance.who}"
+    if acceptance.remark:
+        text += f": {acceptance.remark}"
+    if is_in_place and acceptance.undo:
+        text += f"; to undo the write: {acceptance.undo}"
+    return text
+
+
+def write_text(write: Event) -> str:
+    """Say when a write was made, by whom and where."""
+    place = "the drives"
+    target = Path(write.target)
+    if target.is_absolute():
+        place = target.name
+    return f"{_VERBS[write.action]} on {_when(write.at)} by {write.who} to {place}"
+
+
+def _when(at: datetime) -> str:
+    return minute_text(at.isoformat())
+
+
+def identity(calibration: Calibration) -> dict[str, str]:
+    """Drives, operator, payload, dates, encoders and software as texts by their names; what is missing is said.
+
+    Encoders are there where the robot has more of them than degrees of freedom.
+    """
+    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+    operators = sorted({one.operator for one in recordings if one.operator})
+    payloads = "; ".join(payload_texts(calibration))
+    if payloads and not calibration.gains_fixed:
+        # No residual shows a wrong mass: it must be on the sheet that a person signs.
+        influences = "; ".join(mass_texts(calibration.payload_mass))
+        # Calibrations of earlier versions do not say more.
+        known = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
+        payloads = f"{payloads}; {known}"
+    names = {
+        "Serial numbers": _serials(calibration, recordings),
+        "Operator": ", ".join(operators) or "not known: the recordings name none",
+        "Payload": payloads or "none: every run was recorded without load",
+        "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
+    }
+    if calibration.encoder_misfit is not None:
+        names["Encoders"] = encoder_text(calibration.encoder_misfit)
+    names["Fitted"] = f"{minute_text(calibration.created)}, {calibration.software or 'software not known'}"
+    return names
+
+
+def payload_texts(calibration: Calibration) -> Iterator[str]:
+    """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
+    mounted: dict[tuple[str, float | None], list[float]] = {}
+    for source in calibration.sources:
+        if source.payload is not None:
+            entered = None if source.recording is None else source.recording.entered_kg
+            masses = mounted.setdefault((source.payload, source.mass_kg), [])
+            if entered is not None and entered not in masses:
+                masses.append(entered)
+    for (name, declared), masses in mounted.items():
+        entry = "no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file"
+        scale = "not weighed a second time"
+        if masses:
+            scale = f"{' and '.join(f'{one:g}' for one in masses)} kg on the scale"
+        yield f"{name}: {entry}, {scale}"
+
+
+def _period(times_s: Sequence[float]) -> str:
+    """Write the time between the first and the last recording to the minute, in UTC."""
+    if not times_s:
+        return "not known: the logs have no time of day"
+    first, last = (datetime.fromtimestamp(one, UTC).strftime("%Y-%m-%d %H:%M") for one in (min(times_s), max(times_s)))
+    if first == last:
+        return f"{first} UTC"
+    same_day = first[:10] == last[:10]
+    return f"{first} to {last[11:] if same_day else last} UTC"
+
+
+def _serials(calibration: Calibration, recordings: Sequence[Recording]) -> str:
+    found = []
+    for index, gain in enumerate(calibration.gains):
+        serials = dict.fromkeys(one.serials[index] for one in recordings if index < len(one.serials))
+        known = [str(serial) for serial in serials if serial is not None]
+        if known:
+            found.append(f"{gain.axis} {' and '.join(known)}")
+    return ", ".join(found) or "not known: the drives reported none"

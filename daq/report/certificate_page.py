@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from daq.report.certificate import EARLIER, AxisRow, Certificate, Verdict
-from daq.report.certificate_status import status_text
+from daq.report.certificate import AxisRow, Certificate, Verdict, identity, status_text
 from daq.report.effect_names import WORDS, accepted_text, curve_of, size_text
 from daq.report.gains import MASS_HEADINGS, mass_rows, value_rows, warning_texts, with_deviation
 from daq.report.html import (
@@ -26,7 +25,6 @@ from daq.report.html import (
     table,
     terms,
 )
-from daq.report.identity import identity
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
 from daq.report.text import SHOWN_SIGMAS, percent_text
@@ -72,7 +70,10 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
     calibration = certificate.calibration
     look = _LOOK.get(certificate.verdict, "")
     sign = _SIGN[certificate.verdict]
-    if certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
+    if certificate.contradicted:
+        look = _LOOK[Verdict.REFUSED]
+        sign = _SIGN[Verdict.REFUSED]
+    elif certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
         look = ""
         sign = _SIGN[Verdict.READY]
     return html_page(
@@ -112,6 +113,9 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
     """The next step, below the verdict."""
     comparison = certificate.comparison
     if comparison.in_force is not None:
+        acceptance = comparison.standing.acceptance
+        if acceptance is not None and acceptance.undo:
+            yield paragraph(f"To undo the write: `{acceptance.undo}`.", f"next {look}")
         return
     if comparison.unread:
         yield paragraph(comparison.unread, f"next {look}")
@@ -130,21 +134,21 @@ def _warnings(certificate: Certificate) -> Iterator[str]:
 
 
 def _gains(certificate: Certificate) -> str:
-    place = certificate.shown_place
+    compared = certificate.compared_with
     rows = [
         (
             row.change.axis,
-            f"{row.change.old:.5g}",
+            f"{row.change.compared_gain:.5g}",
             f"{with_deviation(gain.value, gain.std)} {gain.unit}",
             _percent(row.change.change_percent),
             _limit(row.allowed_percent),
-            row.words(place),
+            row.words,
         )
         for gain, row in zip(certificate.calibration.gains, certificate.shown, strict=True)
     ]
     return section(
         "Drive gains",
-        table("", ("axis", place, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
+        table("", ("axis", compared, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
         paragraph(f"{certificate.note[0].upper()}{certificate.note[1:]}."),
         pair((_changes(certificate), *_errors(certificate.calibration), _write(certificate))),
     )
@@ -154,8 +158,8 @@ def _interval(row: AxisRow) -> Interval:
     change = row.change
     value = change.change_percent
     half = math.nan
-    if change.old:
-        half = 100.0 * SHOWN_SIGMAS * change.std / abs(change.old)
+    if change.compared_gain:
+        half = 100.0 * SHOWN_SIGMAS * change.std / abs(change.compared_gain)
     if not math.isfinite(value) or not math.isfinite(half):
         value = math.nan
         half = 0.0
@@ -164,10 +168,10 @@ def _interval(row: AxisRow) -> Interval:
 
 def _changes(certificate: Certificate) -> str:
     """Gains beside their limits."""
-    place = certificate.shown_place
-    drawn = intervals([_interval(row) for row in certificate.shown], "Change of each gain", f"from the {place} [%]")
-    caption = f"0 is the {place}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
-    return figure(drawn, caption, f"Change from the {place}")
+    compared = certificate.compared_with
+    drawn = intervals([_interval(row) for row in certificate.shown], "Change of each gain", f"from the {compared} [%]")
+    caption = f"0 is the {compared}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
+    return figure(drawn, caption, f"Change from the {compared}")
 
 
 def _errors(calibration: Calibration) -> Iterator[str]:
@@ -182,7 +186,7 @@ def _errors(calibration: Calibration) -> Iterator[str]:
         )
         return
     nameplate = calibration.nameplate_holdout_error_percent
-    hollow = "" if nameplate is None else " Hollow: the same model with the nameplate gains."
+    hollow = "" if nameplate is None else " Hollow: the same model with the nameplate."
     yield figure(
         _beside(calibration, nameplate, held),
         f"Share of the torque that the model leaves. Full: with the identified gains.{hollow}",
@@ -250,35 +254,38 @@ def _write(certificate: Certificate) -> str:
         return ""
     place = "/".join(edit.file.parts[-2:])
     if comparison.in_force is not None and certificate.before is not None:
-        before = {one.axis: one.old for one in certificate.before.changes}
-        rows = [_written_row(one, before[one.axis], f"{one.old:.9g}") for one in edit.changes]
+        previous = {one.axis: one.compared_gain for one in certificate.before.changes}
+        rows = [_written_row(one, previous[one.axis], f"{one.current_gain:.9g}") for one in edit.changes]
         return part(
             f"What was written into {place}",
-            table("", ("axis", "key", "line", "previous", "current"), rows),
+            table("", ("axis", "key", "line", "previous gain", "current gain"), rows),
             *_old_comments(edit),
         )
     if comparison.in_force is not None or certificate.verdict is Verdict.REFUSED:
         return ""
     if not edit.has_effect:
         return part("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
-    rows = [_written_row(one, one.old, one.spelling or "-") for one in edit.changes]
+    rows = [_written_row(one, one.current_gain, one.spelling or "-") for one in edit.changes]
     return part(
         f"What would be written into {place}",
-        table("", ("axis", "key", "line", "current", "new"), rows),
+        table("", ("axis", "key", "line", "current gain", "new"), rows),
         paragraph("This page writes nothing."),
     )
 
 
-def _written_row(change: GainChange, old: float, new: str) -> tuple[str, ...]:
-    return change.axis, change.key, str(change.line), f"{old:.9g}", new
+def _written_row(change: GainChange, gain_before: float, after: str) -> tuple[str, ...]:
+    return change.axis, change.key, str(change.line), f"{gain_before:.9g}", after
 
 
 def _old_comments(edit: FileEdit) -> Iterator[str]:
-    """Say that comments behind the gains are those of the earlier gains: a write changes numbers alone."""
+    """Say that comments behind the gains are those of the previous gains: a write changes numbers alone."""
     comments = edit.comments
     if comments:
         axis, text = next(iter(comments.items()))
-        yield paragraph(f"The comment behind a gain is still the old one. {axis}: “{text}”.")
+        yield paragraph(
+            "A write changes numbers only, so comments behind the gains may describe the previous gains. "
+            f"{axis}: “{text}”."
+        )
 
 
 def _digests(certificate: Certificate) -> str:
@@ -302,15 +309,15 @@ def _since(certificate: Certificate) -> Iterator[str]:
     earlier, calibration = certificate.earlier, certificate.calibration
     if earlier is None:
         return
-    old = {gain.axis: gain for gain in earlier.gains}
+    earlier_gains = {gain.axis: gain for gain in earlier.gains}
     rows = [
         (
             gain.axis,
-            with_deviation(old[gain.axis].value, old[gain.axis].std),
+            with_deviation(earlier_gains[gain.axis].value, earlier_gains[gain.axis].std),
             with_deviation(gain.value, gain.std),
             _percent(row.change.change_percent),
             f"{abs(row.judged.sigmas):.1f}",
-            row.words(EARLIER),
+            row.words,
         )
         for gain, row in zip(calibration.gains, certificate.since, strict=True)
     ]
@@ -322,7 +329,7 @@ def _since(certificate: Certificate) -> Iterator[str]:
         if now.get(name, then) != then:
             facts.append(f"{name}: {then}; now {now[name]}.")
     change = figure(
-        # The limits are those of a change from the controller, not of one from here.
+        # The limits are those of a change from the current gain, not of one from here.
         intervals(
             [replace(_interval(row), lower=-math.inf, upper=math.inf) for row in certificate.since],
             "Change of each gain",
@@ -374,7 +381,7 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
             "Dependence of the gains on the payload's mass",
             paragraph(
                 "To first order. A wrong mass is in every gain; where the mass is all that is known of the payload, no "
-                "residual shows it. The part of σ that the tolerance of the weighing makes is not in σ of the gains."
+                "residual shows it. σ by the tolerance of the weighing is not included in σ of the gains."
             ),
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )

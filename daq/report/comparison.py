@@ -1,7 +1,7 @@
-"""A calibration beside the gains in the controller, or beside the nameplate, and its state by the cell's ledger.
+"""A calibration beside the current gains, or beside the nameplate, and its state by the cell's ledger.
 
-The judgement is that of `drivegain apply`: the same gates, and the same figures of the history. Where the controller
-was not read, the nameplate takes its place, and the limit of a change is that from the nameplate.
+The judgement is that of `drivegain apply`: the same gates, and the same figures of the history. If the controller was
+not read, the current gains are not known: the gains are compared with the nameplate, and its limit applies.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationRefused, DaqError
 from daq.files import sha256
 from daq.ledger.fold import Event
-from daq.ledger.ledger import Ledger
-from daq.ledger.standing import Standing, read_standing
+from daq.ledger.ledger import Ledger, Standing, read_standing
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.judgement import NOTHING, Spread, known_of, query_history
-from daq.writeback.request import Edit, GainChange, Request
+from daq.writeback.request import Edit, GainChange, GainOrigin, Request
 from daq.writeback.target import propose
 from ident.calibration import Calibration
 
@@ -41,12 +40,12 @@ NO_LEDGER = Standing(
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Gains beside those that are in the controller, or beside the nameplate where it was not read."""
+    """Gains beside the current ones, or beside the nameplate where the controller was not read."""
 
     changes: tuple[GainChange, ...]  #: one an axis
     refusals: tuple[Refusal, ...]  #: failed checks
     policy: ApplyPolicy  #: limits
-    known: Spread = NOTHING  #: σ of the gains in the controller, by the history
+    known: Spread = NOTHING  #: σ of the current gains, by the history
     edit: FileEdit | None = None  #: planned change of the controller's file; None where it was not read
     unread: str = ""  #: why it was not read
     command: str = ""  #: that shows the change and, with --yes, writes it
@@ -73,16 +72,17 @@ class Comparison:
         return write
 
     def allowed_percent(self, change: GainChange) -> tuple[float, float]:
-        """Limits of the change of a gain [% of the one in the controller]; infinite where it has none."""
-        if not change.old or not math.isfinite(change.old):
+        """Limits of the change of a gain [% of the gain that is compared]; infinite where it has none."""
+        compared = change.compared_gain
+        if not compared or not math.isfinite(compared):
             return -math.inf, math.inf
-        nameplate = change.nameplate / change.old
+        nameplate = change.nameplate_gain / compared
         bound = self.policy.max_nameplate_percent
         ends = [100.0 * (nameplate * (1.0 + sign * bound / 100.0) - 1.0) for sign in (-1.0, 1.0)]
         if self.edit is not None:
             most = self.policy.max_change_percent
             if (absolute := self.policy.max_change.get(change.axis)) is not None:
-                most = min(most, abs(100.0 * absolute / change.old))
+                most = min(most, abs(100.0 * absolute / compared))
             ends = [max(min(ends), -most), min(max(ends), most)]
         return min(ends), max(ends)
 
@@ -96,7 +96,8 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
         now: wall-clock time, for the age of the logs.
         cell: from the logs, None where there is none; then the default limits hold.
     """
-    changes = changes_from({gain.axis: gain.nameplate for gain in calibration.gains}, calibration)
+    nameplates = {gain.axis: gain.nameplate for gain in calibration.gains}
+    changes = changes_from(nameplates, GainOrigin.NAMEPLATE, calibration)
     edit = Edit(subject="", before=b"", after=b"", changes=changes)
     refusals = check_gates(GateContext(Request(calibration, now), edit, cell))
     return Comparison(
@@ -107,9 +108,15 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
     )
 
 
-def changes_from(old: Mapping[str, float], calibration: Calibration) -> tuple[GainChange, ...]:
+def changes_from(
+    compared: Mapping[str, float], compared_with: GainOrigin, calibration: Calibration
+) -> tuple[GainChange, ...]:
     """Return the changes of the gains from others, by axis, that are in no file."""
-    return tuple(GainChange.of(gain, "", 0, old[gain.axis], (gain.value, "")) for gain in calibration.gains)
+    changes = []
+    for gain in calibration.gains:
+        change = GainChange.of(gain, "", 0, compared[gain.axis], (gain.value, ""))
+        changes.append(replace(change, compared_with=compared_with))
+    return tuple(changes)
 
 
 def compare(
@@ -173,10 +180,10 @@ def _standing(cell: Cell, request: Request, file: Path | None, audit: Path | Non
 
 
 def before_write(comparison: Comparison, digest: str) -> Comparison | None:
-    """Compare with the gains before the write that is in force; None without one, or where they are not known.
+    """Compare with the previous gains, those before the write that is in force; None where there is none of them.
 
     Args:
-        comparison: with the controller, which has the gains now.
+        comparison: with the controller, whose current gains are those of the calibration.
         digest: SHA-256 of the calibration's file.
     """
     standing = comparison.standing
@@ -185,8 +192,11 @@ def before_write(comparison: Comparison, digest: str) -> Comparison | None:
     before = standing.before
     if any(change.axis not in before for change in comparison.changes):
         return None
-    changes = tuple(replace(change, old=before[change.axis]) for change in comparison.changes)
-    # The gains before were those of another calibration: none is in force for them.
+    changes = tuple(
+        replace(change, compared_gain=before[change.axis], compared_with=GainOrigin.PREVIOUS)
+        for change in comparison.changes
+    )
+    # The previous gains were those of another calibration: none is in force for them.
     others = replace(standing.history, events=())
     known = known_of(others, "", digest, changes)
     return replace(comparison, changes=changes, refusals=(), known=known)

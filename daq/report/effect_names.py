@@ -58,6 +58,7 @@ _WHERE = {
     "presliding": "within about {distance_rad:.2g} rad",
     "hinge": "from a position of {start_rad:.2g} rad on",
     "gravity-compensator": "{order:g} times in a turn of the joint",
+    "zero-offset": "to be added to its position",
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
@@ -144,7 +145,8 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
         sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
     elif effect.settings.get("with_rotor"):
         loss, rest = found
-        inertia = effect.settings["rotor_inertia_kg_m2"] + rest.value / (loss.value or math.inf)
+        # It follows its rest until this is small beside σ: where that is large, the sum may be below zero.
+        inertia = max(0.0, effect.settings["rotor_inertia_kg_m2"] + rest.value / (loss.value or math.inf))
         std = rest.std / (abs(loss.value) or math.inf)
         rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
         sizes = f"{_sized(names[0], loss)}, {rotor}"

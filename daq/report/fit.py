@@ -156,7 +156,8 @@ def fit_view(
     """Gains and errors, what they rest on, and what the data cannot show; `comparison` is of all estimators."""
     fitted = found.fitted
     axes, estimate = fitted.cell.axis_names, fitted.estimate
-    yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
+    title = f"Drive gains of {calibration.cell} by {calibration.method}; change % is from the nameplate"
+    yield gain_table(calibration.gains, title=title)
     yield from (Sentence(text, "bold") for text in warning_texts(calibration))
     for effect in calibration.effects:
         yield Sentence(f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}")
@@ -171,7 +172,7 @@ def fit_view(
             yield Sentence(apart)
     yield ""
     errors = {"fit": calibration.relative_error_percent, "held out": calibration.holdout_error_percent}
-    yield error_table("Relative error ‖ρ‖/‖Y‖ [%]", axes, errors)
+    yield error_table("Relative error of the torques [%]", axes, errors)
     filter_ = fitted.identification.conditioning
     yield Sentence(
         f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, condition "
@@ -373,19 +374,21 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
     if fitted.estimate.gains_fixed:
         return
     drawn = [payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1]
-    mistake = "a wrong payload mass scales all gains alike and leaves no residual"
+    mistake = (
+        "These data do not show a wrong payload mass, or a wrong value of gravity: either scales all gains alike and "
+        "leaves no residual."
+    )
     if drawn:
-        mistake = "a wrong payload mass bends all gains, and leaves little of it in the residual"
+        mistake = (
+            "These data hardly show a wrong payload mass: it changes all gains, and leaves a small residual. A wrong "
+            "value of gravity leaves none."
+        )
         yield (
             f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
             "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper."
         )
-    texts = "; ".join(mass_texts(influences))
-    masses = f" ({texts})" if texts else ""
-    yield (
-        f"Not identifiable from these data: {mistake}{masses}; so does a wrong value of gravity. A gear "
-        "efficiency that is the same in both directions is part of its gain."
-    )
+    masses = "".join(f" {text[0].upper()}{text[1:]}." for text in mass_texts(influences))
+    yield f"{mistake}{masses} A gear efficiency that is the same in both directions is part of its gain."
 
 
 def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator[str]:
@@ -400,7 +403,7 @@ def geometry_notes(check: GeometryCheck | None, axes: Sequence[str]) -> Iterator
     if check.gravity is not None:
         turn = np.degrees(check.gravity.turn_rad)
         std = np.degrees(check.gravity.turn_std_rad)
-        yield f"Gravity, by the torques: {turn:.2f} ± {std:.2f}° from the direction in the cell file."
+        yield f"By the torques, gravity is {turn:.2f} ± {std:.2f}° from its direction in the cell file."
     hidden = hidden_zeros_text(check, axes)
     if hidden:
         yield hidden

@@ -13,6 +13,7 @@ from daq.report.document import Figure, Report
 from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import misfit_text
+from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
@@ -69,7 +70,7 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
     """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
     true = ("truth", "error %") if truth else ()
-    headings = ("axis", "a priori", "identified ± σ", "σ %", "change %", *true, "unit")
+    headings = ("axis", "nameplate", "identified ± σ", "σ %", "change %", *true, "unit")
     table = plain_table(headings, title=title, left=(0, len(headings) - 1))
     for gain in gains:
         row = [
@@ -167,10 +168,13 @@ def encoder_text(misfit: EncoderMisfit) -> str:
 
 
 def _correction_text(one: GeometryCorrection) -> str:
-    """Write what has to be added to a number of the description."""
-    scale, unit = (180.0 / math.pi, "deg") if one.unit == "rad" else (1e3, "mm")
-    place = one.joint if not one.end else f"{one.joint} to {one.end}"
-    return f"the {one.kind} of {place} {scale * one.change:+.4f} ± {max(scale * one.std, 5e-5):.4f} {unit}"
+    """Say how far a number of the description is off, as the diagnoses do."""
+    if one.kind == "zero":
+        unit, scale = (DEGREES, 180.0 / math.pi) if one.unit == "rad" else (MILLIMETRES, 1e3)
+        return zero_off_text(one.joint, scale * one.change, scale * one.std, unit)
+    longer = "longer" if one.change > 0.0 else "shorter"
+    size = f"{1e3 * abs(one.change):.4f} ± {max(1e3 * one.std, 5e-5):.4f} mm"
+    return f"a {one.kind} from {one.joint} to {one.end} that is {size} {longer} than described"
 
 
 def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
@@ -183,13 +187,13 @@ def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
             listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
             wrong = f"the gains are wrong by: {listed}"
             at_most = "at most "
-        text = f"with a mass of {one.payload} that is wrong by 1 %, {wrong}"
+        text = f"if the mass of {one.payload} is wrong by 1 %, {wrong}"
         if one.tolerance_kg > 0.0:
             largest = max(abs(gain.percent_per_percent) for gain in one.gains)
             share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
             text += (
                 f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
-                f"± {share_percent:.2g} % of every gain, not in σ"
+                f"± {share_percent:.2g} % of every gain, not included in σ"
             )
         yield text
 

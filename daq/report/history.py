@@ -72,6 +72,10 @@ class HistoryPoint(Report):
     created: str
     entered: str
     digest: str
+    accepted: bool | None = None
+    """whether new moves confirm the gains of this calibration; left out where none were made"""
+    accepted_at: str | None = None
+    accepted_by: str | None = None
 
 
 class HistoryAxis(Report):
@@ -185,7 +189,7 @@ def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str
     if words is not None:
         say_alarms(all_series, console)
     elif series.drift is not None:
-        console.print(f"No alarm. σ of the changes is {series.dispersion:.2f} × that of the fits.")
+        console.print(f"No alarm. The changes scatter {series.dispersion:.2f} times as much as σ of the fits says.")
 
 
 def say_alarms(all_series: Sequence[Series], console: Console) -> None:
@@ -230,8 +234,8 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
 
 
 def history_gain_table(all_series: Sequence[Series]) -> Table:
-    """Each gain as it was found last, beside its baseline."""
-    headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
+    """Each gain as it was identified last, beside its baseline."""
+    headings = ("axis", "identified ± σ", "nameplate", "since baseline %", "in σ", "state", "unit")
     table = plain_table(headings, left=(0, 5, 6), wrap=(3,))
     for series in all_series:
         if not series.points:
@@ -294,7 +298,7 @@ def history_report(
         entries: its calibrations.
         chosen: axes that were asked for.
         all_series: all axes.
-        in_force: digest of the calibration whose gains the controller has.
+        in_force: digest of the calibration whose gains are the current gains.
         checked: state of audit log and history; None where it was not asked for.
     """
     others = {} if checked is None else {"audit": audit_report(checked)}
@@ -327,8 +331,8 @@ def say_verification(found: Verification, console: Console) -> None:
     )
     if not found.noted:
         console.print(
-            f"No {head_file(found.audit).name} with the digest of the last entry: whether the end of the audit log is "
-            "missing cannot be seen. The next entry is noted again."
+            f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of the audit log would "
+            "not be noticed. The next entry writes it again."
         )
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
@@ -370,11 +374,13 @@ def audit_report(found: Verification) -> AuditReport:
 
 
 _WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
-"""Words for an event after which a controller had the gains of a calibration."""
+"""Words for an event after which the gains of a calibration were the current gains."""
+_VERDICTS = {True: "accepted by", False: "NOT ACCEPTED by"}
+"""Words for what new moves with these gains have shown."""
 
 
 def in_force(cell: Cell, history: History) -> str | None:
-    """Return the digest of the calibration whose gains this cell's own controller has.
+    """Return the digest of the calibration whose gains are the current gains of this cell.
 
     The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
     (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts. None where the
@@ -399,7 +405,13 @@ def in_force(cell: Cell, history: History) -> str | None:
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
-    """Return the writes of each calibration in words, by its digest; events are of all controllers, oldest first."""
+    """Return what was done with each calibration in words, by its digest: writes, rollbacks and acceptance.
+
+    Args:
+        entries: the calibrations.
+        events: writes to all controllers, oldest first.
+        digest_in_force: of the calibration whose gains the controller has; None for other numbers.
+    """
     described = {}
     for entry in entries:
         parts = []
@@ -410,6 +422,9 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
             then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
             if then is not None and then.action is WriteAction.ROLLED_BACK:
                 parts.append(f"rolled back by {then.who}")
+        if entry.acceptance is not None:
+            verdict = _VERDICTS[entry.acceptance.accepted]
+            parts.append(f"{verdict} {entry.acceptance.who}")
         if entry.digest == digest_in_force:
             parts.append("in force")
         described[entry.digest] = ", ".join(parts) or "-"
@@ -426,7 +441,7 @@ def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
         put = [rewrite_gain(numbers[gain.axis][0], gain.value, gain.std, numbers[gain.axis][1]) for gain in entry.gains]
     except ControllerUnfit:
         return False
-    return all(one.new == one.old for one in put)
+    return all(one.new == one.current_gain for one in put)
 
 
 COLUMNS = tuple(HistoryPoint.model_fields)
@@ -463,6 +478,11 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
     if point.entry.events:
         last = point.entry.events[-1]
         known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
+    acceptance = point.entry.acceptance
+    if acceptance is not None:
+        known["accepted"] = acceptance.accepted
+        known["accepted_at"] = acceptance.at
+        known["accepted_by"] = acceptance.who
     return HistoryPoint.of(
         point.entry,
         None,
@@ -485,7 +505,7 @@ _FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 Decembe
 
 
 def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
-    """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
+    """Draw gains ± 2σ, those that were written filled, alarms; CUSUM, trend and deviations over their limits.
 
     There is at least one series; the kind is png or svg.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from daq.documents.calibration_file import EffectEntry
-from daq.documents.session_state import GuidedState, Outcome, SessionState
+from daq.documents.session_state import GuidedState, JobState, Outcome
 from daq.report.document import Figure, Report
 
 
@@ -108,7 +108,7 @@ class ConcludedJob(RefusedJob):
     folder: str
 
 
-class JobReport(SessionState, ConcludedJob):
+class JobReport(JobState, ConcludedJob):
     """`recalibrate`: what is left to do, and the state of its session."""
 
     # Keys of the base that is named last come first.
@@ -124,11 +124,12 @@ class SessionReport(GuidedState, ConcludedJob):
 
 
 class ProposedGain(Report):
-    """A gain in the controller's file and the one that a job proposes."""
+    """A current gain in the controller's file, and the gain that a job proposes."""
 
     axis: str
     key: str
     old: Figure
+    """current gain; the key keeps its name"""
     new: Figure
     std: float
     unit: str

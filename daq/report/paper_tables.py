@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rich.console import RenderableType
 
 from daq.report.text import plain_table, printable, terminal_text
-from daq.workflow.validate import MANUFACTURER, CrossValidation
+from daq.workflow.validate import NAMEPLATE_LABEL, CrossValidation
 from ident.calibration import Calibration, Gain, Parameter
 
 NONE = "—"
@@ -93,7 +93,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
 
 
 def paper_gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone."""
+    """Build Table 2 or 4: nameplate and identified gains, with the payload's drawing and with its mass alone."""
     rows = [
         (one.axis, f"{one.nameplate:.4g}", *_gain_cells(one), *_gain_cells(other))
         for one, other in zip(first.gains, second.gains, strict=True)
@@ -102,9 +102,9 @@ def paper_gain_table(number: int, first: Calibration, second: Calibration, metho
     return PaperTable(
         number=number,
         title=f"drive gains, {method}",
-        headings=("axis", "a priori", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
+        headings=("axis", "nameplate", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
         rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
-        notes=("%e is the change from the a priori gain.", SIGMA_NOTE),
+        notes=("%e is the change from the nameplate.", SIGMA_NOTE),
     )
 
 
@@ -120,8 +120,8 @@ def condition_table(found: CrossValidation) -> PaperTable:
         headings=("", *(run.run for run in found.runs)),
         rows=(("cond(W)", *(NONE if run.condition is None else f"{run.condition:.0f}" for run in found.runs)),),
         notes=(
-            "A small number means that the moves show all base parameters of the run evenly; its payload is taken as "
-            "part of the last link. `plan` allows 3500, for a closed chain 1e5.",
+            "The smaller the number, the more evenly the moves show all base parameters. The payload counts as part of "
+            "the last link. `plan` allows 3500, and 1e5 for a closed chain.",
         ),
     )
 
@@ -186,7 +186,7 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
             columns.append((f"{mass.mass_kg:.3f}", *map(percent, percents)))
             if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
-        names = (f"{run.run}, kg", "σ %, moves alone", "σ %, with the calibration's", ERROR_ROW)
+        names = (f"{run.run}, kg", "σ %, moves alone", "σ %, with σ of the calibration", ERROR_ROW)
         *figures, difference = zip(names, *columns, strict=True)
         rows += figures
         if run.weighed_kg is not None:
@@ -195,18 +195,18 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     if runs[0].weighed_kg is not None:
         weighed = f"{runs[0].weighed_kg:g} kg"
         rows.append((f"mean {ERROR_ROW}", *(percent(_mean(errors[label])) for label in labels)))
-    how = "the payload and the joints' friction, on the robot of the calibration"
+    how = "payload and friction are estimated from this run, the robot is that of the calibration"
     if found.with_bare_runs:
-        how = "robot and payload together, from this run and the runs without load"
-    # The label of gains that no calibration has is for documents; a reader knows them by the cell file's word.
-    shown = ("nameplate" if label == MANUFACTURER and label not in found.calibrations else label for label in labels)
+        how = "robot and payload are estimated together, from this run and the runs without load"
+    # The label is a key of documents; a reader knows these gains as the nameplate.
+    shown = ("nameplate" if label == NAMEPLATE_LABEL and label not in found.calibrations else label for label in labels)
     return PaperTable(
         number=number,
         title=f"mass of payload {name} ({mounting}), {weighed}",
         headings=("run", *shown),
         rows=tuple(rows),
         notes=(
-            f"Found by the gains of each column: {how}. Gains that find the mass of the scale may still be wrong: "
+            f"Each column weighs with its own gains: {how}. Gains that find the right mass may still be wrong, because "
             "errors of several axes can cancel.",
             *dict.fromkeys(notes),
         ),

@@ -18,11 +18,12 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.files import open_regular, replace_file, sha256
 from daq.report.html import element, html_document, html_list, palette, visible_text
+from daq.workflow.accepted_room import extent, placed
 from daq.workflow.experiment import PlannedMove, experiment_of, path_of
 from daq.workflow.plan import Plan
 from ident.arrays import FloatArray
 from ident.model.robot import poses
-from ident.planning.clearance import BASE, Checker
+from ident.planning.clearance import Checker
 
 STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and their largest number
 MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
@@ -54,7 +55,7 @@ canvas { width: 100%; display: block; } #clearance { height: 9rem; }
 )
 
 
-def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, plan: bytes) -> str:
+def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, plan: bytes, purpose: str = "") -> str:
     """Build the page.
 
     Args:
@@ -62,13 +63,16 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
         moves: of the plan; the page starts at the first target.
         checker: distances of the arm.
         plan: content of the plan file, whose digest the page carries.
+        purpose: what the moves were planned for; empty for a first plan.
     """
     script = (Path(__file__).parent / "plan_preview.js").read_text(encoding="utf-8")
     drawn = preview_data(cell, moves, checker)
     data = json.dumps(drawn, separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")  # no name in it ends the script
+    planned_for = element("p", f"Planned for {purpose}", "act") if purpose else ""
     body = f"""\
 {element("h1", f"Plan for cell {cell.name}: {len(moves)} moves in {drawn['time_s'][-1]:.0f} s")}
+{planned_for}
 <canvas id="arm"></canvas>
 <div class="controls"><button id="play">Play</button><input id="time" type="range" min="0" value="0" aria-label="time">
 <span id="now" role="status"></span></div>
@@ -100,7 +104,8 @@ def save_preview(cell: Cell, plan: Plan, file: Path, page: Path) -> None:
         OSError: from the file system.
     """
     checker = experiment_of(cell).scene.checker
-    replace_file(page, preview_page(cell, plan.moves, checker, file.read_bytes()).encode())
+    content = preview_page(cell, plan.moves, checker, file.read_bytes(), plan.purpose)
+    replace_file(page, content.encode())
 
 
 def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> dict[str, Any]:
@@ -108,16 +113,14 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
     time_s, position, speed, move = _rows(cell, moves)
     scene = checker.scene
     at = poses(checker.robot, checker.joints(position))
-    frame = [capsule.link + 1 for capsule in scene.capsules]
-    ends = np.array([(capsule.start_m, capsule.end_m) for capsule in scene.capsules]).reshape(-1, 1, 2, 3)
-    placed = np.einsum("ckij,cxej->kcei", at.rotation[frame], ends) + at.origin_m[frame].swapaxes(0, 1)[:, :, None]
+    ends_m = placed(checker, position)
     origins = at.origin_m.swapaxes(0, 1)
-    least, most, radius_m = _reach(placed, checker)
+    reach = extent(checker, ends_m)
     clearance_mm = 1000.0 * (checker.margins(position) + scene.minimum_m)
     boxes = list(scene.boxes)
     if scene.workspace is not None:
         boxes.append(scene.workspace)
-    seen = np.concatenate((origins.reshape(-1, 3), [least, most]))
+    seen = np.concatenate((origins.reshape(-1, 3), [reach.lower_m, reach.upper_m]))
     # A box that reaches far beyond the arm, such as a floor, must not make the arm small.
     span = float(np.linalg.norm(np.ptp(seen, axis=0)))
     corners = np.array([(box.lower_m, box.upper_m) for box in boxes]).reshape(-1, 3)
@@ -131,7 +134,7 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         "move": move.tolist(),
         "moves": len(moves),
         "origins_m": _rounded(origins, 3),
-        "ends_m": _rounded(placed, 3),
+        "ends_m": _rounded(ends_m, 3),
         "capsules": [
             {"name": visible_text(one.name), "link": one.link, "radius_m": one.radius_m} for one in scene.capsules
         ],
@@ -145,9 +148,9 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
             for one in boxes
         ],
         "reach": {
-            "lower_m": _rounded(least, 3),
-            "upper_m": _rounded(most, 3),
-            "radius_m": round(radius_m, 3),
+            "lower_m": _rounded(reach.lower_m, 3),
+            "upper_m": _rounded(reach.upper_m, 3),
+            "radius_m": round(reach.radius_m, 3),
         },
         "grid_m": _GRID_M,
         "frame_m": [_rounded(lower, 3), _rounded(upper, 3)],
@@ -160,27 +163,6 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
             for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
         ],
     }
-
-
-def _reach(ends_m: FloatArray, checker: Checker) -> tuple[FloatArray, FloatArray, float]:
-    """Return where the moving parts come over the plan [m].
-
-    Args:
-        ends_m: ends of all capsules, shape (rows, capsules, 2, 3).
-        checker: distances of the arm.
-
-    Returns:
-        lower and upper end in the base frame, shape (3,) each, and largest distance from its z axis.
-    """
-    capsules = checker.scene.capsules
-    moving = np.array([capsule.link != BASE for capsule in capsules], dtype=np.bool_)
-    if not moving.any():
-        return np.zeros(3), np.zeros(3), 0.0
-    ends = ends_m[:, moving]
-    radius_m = np.array([capsule.radius_m for capsule in capsules])[moving, None]
-    lower = (ends - radius_m[..., None]).min(axis=(0, 1, 2))
-    upper = (ends + radius_m[..., None]).max(axis=(0, 1, 2))
-    return lower, upper, float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max())
 
 
 def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.judgement import NOT_JUDGED, NOTHING, Spread, judge, noise_note
-from daq.writeback.request import Edit, GainChange
+from daq.writeback.request import Edit, GainChange, GainOrigin
 from daq.writeback.target import E, Proposal, Written
 
 
@@ -31,12 +31,13 @@ class Refused(Report):
 
 
 class FileGain(Report):
-    """A gain in the controller's file and its planned value."""
+    """A current gain in the controller's file, and the gain that is planned there."""
 
     axis: str
     key: str
     line: int
     old: Figure
+    """current gain; the key keeps its name"""
     new: Figure
     """as it is read back; null where there is none to write"""
     change_percent: Figure
@@ -69,12 +70,12 @@ class RestoredObject(Report):
     axis: str
     object: str
     old: Figure
-    """null where the drive has no number"""
+    """current gain, as a number of the drive; null where the drive has none"""
     new: Figure
 
 
 class DriveGain(RestoredObject):
-    """An object in a drive and its planned value."""
+    """A current gain in a drive, and the gain that is planned there."""
 
     std: float
     nameplate: float
@@ -121,35 +122,35 @@ class DriveRollback(Report):
 def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
     """Print the change as a table and as a diff, judged by the history."""
     edit = proposal.edit
-    console.print(change_table(edit.changes, known, _place(edit)))
-    note = noise_note(edit.changes, known, f"the number {_place(edit)}")
+    console.print(change_table(edit.changes, known))
+    note = noise_note(edit.changes, known)
     console.print(terminal_text(f"* {note}"), style="dim")
     judged, sentence = judge(edit.changes, known)
     if judged and edit.has_effect and not any(change.significant for change in judged.values()):
         console.print(terminal_text(f"{sentence[0].upper()}{sentence[1:]}. Nothing needs to be written."))
     console.print()
     if isinstance(edit, DriveEdit):
-        for change, value in zip(edit.changes, edit.values, strict=True):
-            console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}")
+        console.print(terminal_lines(edit.diff.removesuffix("\n")))
     if isinstance(edit, FileEdit) and edit.diff:
         _show_diff(terminal_lines(edit.diff), console)
 
 
-def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place: str = "in the file") -> Table:
-    """Make the table of old and new gains, with the figures to judge a change by."""
-    headings = ("axis", place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %", "unit")
+def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Table:
+    """Make the table of current and new gains, with the figures to judge a change by."""
+    current = GainOrigin.CURRENT.value
+    headings = ("axis", current, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "from it %", "unit")
     table = plain_table(headings, left=(0, len(headings) - 1))
     judged, _ = judge(changes, known)
     for change in changes:
         found = judged.get(change.axis, NOT_JUDGED)
         table.add_row(
             terminal_text(change.axis),
-            f"{change.old:.5g}",
+            f"{change.current_gain:.5g}",
             with_deviation(change.new, change.std),
             f"{change.std_percent:.2f}",
             f"{change.change_percent:+.1f}",
             f"{abs(found.sigmas):.1f} {'*' if found.significant else ' '}",
-            f"{change.nameplate:.5g}",
+            f"{change.nameplate_gain:.5g}",
             f"{change.nameplate_percent:+.1f}",
             terminal_text(change.unit),
         )
@@ -165,7 +166,15 @@ def proposal_report(proposal: Proposal[E], written: Written | None, known: Sprea
     changes = []
     for change in edit.changes:
         judged = judgements.get(change.axis, NOT_JUDGED)
-        changes.append(FileGain.of(change, judged, change_sigmas=judged.sigmas))
+        changes.append(
+            FileGain.of(
+                change,
+                judged,
+                old=change.current_gain,
+                change_sigmas=judged.sigmas,
+                nameplate=change.nameplate_gain,
+            )
+        )
     return FileChange.of(
         edit,
         proposal,
@@ -186,10 +195,14 @@ def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange
         base_sha256=edit.base_sha256,
         base=edit.base,
         applied=written is not None,
-        changes=[DriveGain.of(change, object=change.key) for change in edit.changes],
+        changes=[_drive_gain(change) for change in edit.changes],
         refusals=proposal.refusals,
         **outcome,
     )
+
+
+def _drive_gain(change: GainChange) -> DriveGain:
+    return DriveGain.of(change, object=change.key, old=change.current_gain, nameplate=change.nameplate_gain)
 
 
 def _outcome(written: Written) -> dict[str, Any]:
@@ -204,7 +217,7 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
         console.print(f"{value.axis.name}, {value.parameter}: {value.value:.9g} -> {new:.9g}")
     if edit.record is not None:
         console.print(
-            f"These are the values before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
+            f"These are the gains before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
         )
 
 
@@ -232,7 +245,7 @@ def show_file_rollback(written: Written, console: Console) -> None:
     """Print a rollback of the controller's file as a diff and a line."""
     edit, backup = written.edit, written.backup
     _show_diff(terminal_lines(_rollback_diff(edit)), console)
-    replaced = "the file was gone" if backup is None else f"the content before is now {backup.name}"
+    replaced = "the file was gone" if backup is None else f"the replaced content is in {backup.name}"
     source = "" if edit.source is None else edit.source.name
     console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
 
@@ -261,7 +274,3 @@ def _show_diff(diff: str, console: Console) -> None:
 
 
 _DIFF_STYLES = {"+": "green", "-": "red", "@": "cyan"}
-
-
-def _place(edit: Edit) -> str:
-    return "in the drive" if isinstance(edit, DriveEdit) else "in the file"

@@ -64,7 +64,7 @@ def residual_view(
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
     gains = "Drive gains with the effects" if calibration.effects else "Drive gains"
-    yield gain_table(calibration.gains, title=f"{gains}; change % is from the a priori gain")
+    yield gain_table(calibration.gains, title=f"{gains}; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(
@@ -211,7 +211,7 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
     """Relative error of each axis before and after, and what noise alone would leave."""
-    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, error_rows(account))
+    return error_table("Relative error of the motor currents by ml [%]", axes, error_rows(account))
 
 
 def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
@@ -285,7 +285,7 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
                 "shows it, or it left together with them."
             )
         elif verdict.written:
-            yield f"Undecided, and written as asked: {name}: {evidence}."
+            yield f"Undecided, and written because of --write-undecided: {name}: {evidence}."
         else:
             yield (
                 f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass --write-undecided to "
@@ -356,7 +356,17 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
         if 3.0 * part.choice_std >= part.after_std > 0.0
     ]
     if shares:
-        yield f"σ of the gains includes the choice of the effects (squares add): {', '.join(shares)}."
+        listed = ", ".join(shares)
+        yield f"σ of the gains includes the choice of the effects (squares add): {listed}.{_open_text(fitted)}"
+
+
+def _open_text(fitted: Fit) -> str:
+    """Name the effects that are not in the model and may be true; empty without any."""
+    names = [placed.name_among(fitted.cell.place_names) for placed in fitted.steps[-1].left_open]
+    if not names:
+        return ""
+    verb = "is" if len(names) == 1 else "are"
+    return f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that would move."
 
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
@@ -430,7 +440,7 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
             when, causes = _FLOOR_CAUSES[floor.source]
             yield (
                 f"{axis} has no noise floor: its current {when} scatters {floor.noise_a / left_a:.1f} times "
-                f"as much as the model's error in motion; possible causes: {causes}."
+                f"as much as the model's error in motion. Possible causes: {causes}."
             )
 
 
@@ -468,8 +478,8 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         )
     elif not skew.confirmed:
         yield (
-            "A time skew between currents and positions is not confirmed: by instruments from the demanded motion it "
-            f"is {1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms, which may be zero."
+            "A time skew between currents and positions is not confirmed: instruments from the demanded motion give "
+            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
         )
 
 
@@ -486,15 +496,15 @@ def gear_sentences(fitted: Fit) -> Iterator[str]:
 def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str]:
     if in_model and gear.efficiency is not None and gear.gain_factor is not None:
         yield (
-            f"The loss in the gear of {name} is an efficiency of {100.0 * gear.efficiency:.1f} % if motor and load "
-            f"lose the same share; its motor's gain is then {100.0 * (gear.gain_factor - 1.0):.2f} % larger than the "
-            "one found, which no residual can show."
+            f"If motor and load lose the same share, the gear of {name} has an efficiency of "
+            f"{100.0 * gear.efficiency:.1f} %. The gain of its motor is then "
+            f"{100.0 * (gear.gain_factor - 1.0):.2f} % larger than the identified one, which no residual can show."
         )
     elif gear.gain_carries_it and gear.hidden_shift is not None and gear.loss_std is not None:
         side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
         yield (
-            f"The gain of {name} carries the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of the "
-            f"squared load torque, and a loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show; it "
+            f"The gain of {name} includes the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of "
+            f"the squared load torque. A loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show, and "
             f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
         )
 
@@ -558,6 +568,10 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     place = placed.axis if placed.effect.has_axis else None
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
+    if is_correction(placed):  # it is judged by all motors together
+        subject = name if placed.effect.has_axis else "The recording"
+        change = error_change_text(before.total, after.total)
+        return f"{subject} has {what}: the error of all axes {where} {change}."
     if not placed.effect.has_axis:
         return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
     without = before.at(placed.axis)
@@ -606,6 +620,6 @@ def _silence(fitted: Fit) -> str:
     clockless = len(trained) > 1 and session_began_s(trained) is None
     unseen = " The runs have no common clock: a warm-up over the session cannot be seen." if clockless else ""
     return (
-        f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
-        f"square in motion): {limits}.{unseen}"
+        f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean square in motion: "
+        f"{limits}.{unseen}"
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
 from daq.errors import writing
 from daq.files import replace_file
-from daq.ledger.standing import Standing
+from daq.ledger.ledger import Standing
 from daq.report.certificate import Origin, certify
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import Comparison, without_controller
@@ -101,8 +101,23 @@ def residual_page(
     session: str | None = None,
 ) -> str:
     """Build the certificate of a closed loop with the account of its turns folded below; see `save_report`."""
-    axes = fitted.cell.axis_names
     comparison = comparison or beside_nameplate(fitted, calibration)
+    certificate = certify(calibration, comparison, origin=Origin.of(calibration, session))
+    details = page_details(fitted, account, calibration)
+    return certificate_page(certificate, details.consequence, details.sections)
+
+
+@dataclass(frozen=True, slots=True)
+class PageDetails:
+    """What a page shows of a closed loop, beside what is in the calibration."""
+
+    consequence: str  #: what the effects change in the gains, a sentence
+    sections: tuple[str, ...]  #: folded sections, HTML
+
+
+def page_details(fitted: Fit, account: Account, calibration: Calibration) -> PageDetails:
+    """Return the account of a closed loop's turns for its page; see `save_report`."""
+    axes = fitted.cell.axis_names
     errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account).items()]
     sections = []
     before = start_of(fitted)
@@ -111,11 +126,11 @@ def residual_page(
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
     sentences = (*declared_sentences(fitted), *summary(fitted, account, calibration.effects))
-    details = (
+    folded_sections = (
         folded("What was found, in sentences", html_list(sentences)),
         folded(
             "Errors without and with the effects",
-            table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors, "names"),
+            table("Relative error of the motor currents [%]", ("", *axes, "total"), errors, "names"),
             paragraph(
                 "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                 "in total with each current weighted by its gain. Compare errors only under the same filters (end "
@@ -135,8 +150,7 @@ def residual_page(
         *(_turn(fitted, number, step) for number, step in enumerate(searched_steps(fitted), start=1)),
         _limits(fitted, calibration),
     )
-    certificate = certify(calibration, comparison, origin=Origin.of(calibration, session))
-    return certificate_page(certificate, gains_sentence(fitted, account), details)
+    return PageDetails(gains_sentence(fitted, account), folded_sections)
 
 
 def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
@@ -180,7 +194,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 def _gains(fitted: Fit, account: Account) -> str:
     if fitted.estimate.gains_fixed:
-        return folded("Gains without and with the effects", paragraph("The gains were held at their nameplate values."))
+        return folded("Gains without and with the effects", paragraph("The gains were held at the nameplate."))
     rows = []
     shifts = []
     for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):

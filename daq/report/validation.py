@@ -105,7 +105,7 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     """Relative errors, doubts about the logs, condition numbers and weighed payloads."""
     validations = found.validations
     headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
-    table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
+    table = plain_table(headings, title="Relative error of the torques [%]", left=(0, len(headings) - 1), wrap=(0,))
     errors = [(validation.run, validation.error, validation.data_use.value) for validation in validations]
     if len(validations) > 1:
         errors.append(("together", together(validations), ""))

@@ -14,6 +14,7 @@ from datetime import datetime
 from io import StringIO
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address
@@ -21,11 +22,12 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun
 from daq.documents.calibration_file import EffectEntry, as_document
-from daq.documents.session_state import SessionState
+from daq.documents.session_state import JobState
 from daq.environment import shipped_configurations
 from daq.errors import CalibrationRefused, UsageError
 from daq.files import replace_file
-from daq.jobs.context import GainTarget, SessionContext, Tools
+from daq.jobs.context import SessionContext, Tools
+from daq.jobs.gain_target import GainTarget
 from daq.jobs.journal import Form, Journal
 from daq.jobs.operator import GivenAnswers
 from daq.jobs.recording import FixedRuns
@@ -42,9 +44,9 @@ from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan, save_plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes
-from daq.writeback.file_target import FileEdit, FileTarget
+from daq.writeback.file_target import FileEdit
 from daq.writeback.request import Request
-from daq.writeback.target import Proposal, Written, apply, propose
+from daq.writeback.target import Proposal, Target, Written, apply, propose
 from drivers.canopen.bus import open_bus
 from drivers.canopen.network import SignalBlocker
 from drivers.canopen.node_scan import FoundNode
@@ -204,18 +206,16 @@ class DemoStages:
             FixedRuns(_planned_runs(out, masses_kg)),
             # A run powers on a cell that carries its payload: there is nothing to mount.
             GivenAnswers("demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell"),
-            GainTarget(cell.controller, controller_copy, HistoryPlace(out / "history.sqlite", out / AUDIT)),
-            self._tools(controller_copy),
+            GainTarget(cell, HistoryPlace(out / "history.sqlite", out / AUDIT), controller_copy),
+            self._tools(),
             Journal(StringIO(), Form.TEXT, self._now),
         )
         at = self._now().isoformat(timespec="seconds")
-        state = SessionState(
-            session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at
-        )
+        state = JobState(session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at)
         with suppress(CalibrationRefused):
             run_stages(TO_DECISION, context, save(Session(out, state)))
 
-    def _tools(self, controller_copy: Path) -> Tools:
+    def _tools(self) -> Tools:
         """Return the tools of a job, which report their progress and keep what they make."""
         reporter = self._reporter
 
@@ -232,9 +232,9 @@ class DemoStages:
             self.calibration = calibration_of(fitted, created)
             return self.calibration
 
-        def propose_copy(_target: FileTarget, request: Request) -> Proposal[FileEdit]:
+        def propose_copy(target: Target[Any], request: Request) -> Proposal[FileEdit]:
             reporter.step("write the calibration to a copy of the controller file")
-            self.proposal = propose(FileTarget.of(self._cell, controller_copy), request)
+            self.proposal = propose(target, request)
             return self.proposal
 
         def apply_copy(proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str) -> Written | None:

@@ -14,9 +14,9 @@ from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE
 from daq.config.checks import centre_faults, gyration_faults, moment_faults
-from daq.config.document_kind import DocumentKind
 from daq.config.yaml_file import (
     Document,
+    DocumentKind,
     Fault,
     Location,
     StrictModel,

@@ -34,7 +34,7 @@ class Case:
     title: str  #: over its column of a table
     method: Method  #: estimator
     known: Known  #: of the payload
-    gains_fixed: bool = False  #: hold the gains at their nameplate values
+    gains_fixed: bool = False  #: hold the gains at the nameplate
 
 
 CASES = (

@@ -17,8 +17,10 @@ The order of the judgements, causes before their traces:
 5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
 6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
    degrees of freedom: found before any torque is looked at, and named first.
-7. Small mistakes of the description (`check_diagnoses`): zeros, mounting and late positions, by torque. They are named
-   before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+7. Small mistakes of the description: zeros, mounting and late positions, by torque. Beside a fit they are those of
+   `check_diagnoses`; after a search, those that it corrects (`correction_diagnoses`), those that held-out runs leave
+   undecided or that it has set aside (`open_correction_diagnoses`), and what the check says beside its model. They are
+   named before 4. to 6., and where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 """
 
@@ -35,10 +37,13 @@ import numpy as np
 from daq.advice import for_command_line
 from daq.config.cell import Cell, model_of, robot_of
 from daq.workflow.geometry_diagnoses import geometry_diagnoses
+from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text, zero_remedy
 from ident.arrays import FloatArray
 from ident.data.run import Run
+from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.discovery.loop import Step
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
 from ident.equations.instants import Instants, read_instants
@@ -311,6 +316,59 @@ def correction_diagnoses(evidence: Evidence, cell: Cell) -> tuple[Diagnosis, ...
     return tuple(found)
 
 
+def open_correction_diagnoses(steps: Sequence[Step], cell: Cell) -> tuple[Diagnosis, ...]:
+    """Diagnoses of corrections that a search has found and that are not in its model, although nothing refutes them.
+
+    Held-out runs have left them undecided, or the search has set them aside. The description may be wrong by them, and
+    the gains are those of a robot as it is described.
+
+    Args:
+        steps: of the search, with the verdicts of held-out runs.
+        cell: whose description it is.
+    """
+    if not steps:
+        return ()
+    last = steps[-1]
+    model = (last.after.uncorrected or last.after).model
+    found: list[Diagnosis] = []
+    for verdict in last.verdicts:
+        placed = verdict.placed
+        is_undecided = verdict.judgement is Judgement.UNDECIDED and not verdict.written
+        if is_undecided and is_correction(placed):
+            values, deviations = _values_in_search(steps, placed)
+            why = f"held-out runs do not decide it: {verdict.reason}"
+            found.append(_open_correction(placed, values, deviations, why, cell, model))
+    for aside in last.set_aside:
+        finding = aside.finding
+        placed = PlacedEffect(finding.effect, finding.axis)
+        # What left by its own σ may be zero.
+        is_known = placed in last.after.effects or placed in last.left_open
+        if is_correction(placed) and not is_known:
+            why = aside.reason(cell.place_names)
+            found.append(_open_correction(placed, finding.coefficients, finding.deviations, why, cell, model))
+    return tuple(found)
+
+
+def _values_in_search(steps: Sequence[Step], placed: PlacedEffect) -> tuple[FloatArray, FloatArray]:
+    """Coefficients of an effect, and σ, in the last model that had it; as it was found where none is left."""
+    for step in reversed(steps):
+        if placed in step.after.effects:
+            return coefficients_of(step.after.estimate, placed)
+    for step in reversed(steps):
+        found = step.accepted
+        if found is not None and PlacedEffect(found.effect, found.axis) == placed:
+            return found.coefficients, found.deviations
+    raise ValueError(f"no step of the search has {placed.effect.name}; expected the steps that its verdict is of")
+
+
+def _open_correction(
+    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, why: str, cell: Cell, model: Model
+) -> Diagnosis:
+    """Diagnosis of a correction that is not in the model, with the reason why it is not."""
+    diagnosis = _correction_diagnosis(placed, values, deviations, cell, model)
+    return replace(diagnosis, found=f"{diagnosis.found}; the gains are without this correction ({why})")
+
+
 def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
     """Diagnosis of a geometry that has changed since a calibration.
 
@@ -324,8 +382,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
     name = axes[placed.axis]
     match placed.effect:
         case ZeroOffset():
-            offset = _offset_text(placed.axis, drift.values, drift.deviations, model)
-            found = f"the zero of {name} off by {offset} since the calibration"
+            found = f"{_zero_text(placed.axis, name, drift.values, drift.deviations, model)} since the calibration"
             expected = "the zero of the calibration"
             remedy = "reference the axis again, or calibrate anew"
         case LatePosition():
@@ -365,14 +422,11 @@ def _correction_diagnosis(
     name = cell.place_names[placed.axis]
     match placed.effect:
         case ZeroOffset():
-            _, scale, key = _zero_unit(model, placed.axis)
-            entered = scale * (cell.axes[placed.axis].zero_offset_rad + values[0])
-            found = f"the zero of {name} off by {_offset_text(placed.axis, values, deviations, model)}"
+            unit, scale = _zero_unit(model, placed.axis)
+            described = scale * cell.axes[placed.axis].zero_offset_rad
+            found = _zero_text(placed.axis, name, values, deviations, model)
             expected = "positions whose zero is that of the URDF"
-            remedy = (
-                f"correct `{key}` of {name} in the cell file to {entered:.2f}, or the zero in the controller, and fit "
-                "again"
-            )
+            remedy = zero_remedy(name, scale * values[0], scale * deviations[0], unit, described) + "; then fit again"
         case LatePosition():
             delay = f"{1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
             late = "late" if values[0] > 0.0 else "early"
@@ -393,17 +447,17 @@ def _correction_diagnosis(
     return _diagnosis_of(placed, name, (), found, expected, remedy)
 
 
-def _zero_unit(model: Model, axis: int) -> tuple[str, float, str]:
-    """Unit of an axis' zero, how many of it are in a radian or metre, and the key of the cell file."""
+def _zero_unit(model: Model, axis: int) -> tuple[str, float]:
+    """Unit of an axis' zero, and how many of it are in a radian or metre."""
     if model.robot.axes[axis].kind is JointKind.PRISMATIC:
-        return "mm", 1e3, "zero_offset_mm"
-    return "°", float(np.degrees(1.0)), "zero_offset_deg"
+        return MILLIMETRES, 1e3
+    return DEGREES, float(np.degrees(1.0))
 
 
-def _offset_text(axis: int, values: FloatArray, deviations: FloatArray, model: Model) -> str:
-    """Size of a zero offset with σ."""
-    unit, scale, _ = _zero_unit(model, axis)
-    return f"{scale * values[0]:+.2f} ± {scale * deviations[0]:.2f} {unit}"
+def _zero_text(axis: int, name: str, values: FloatArray, deviations: FloatArray, model: Model) -> str:
+    """Say how far a zero is off, with σ."""
+    unit, scale = _zero_unit(model, axis)
+    return zero_off_text(name, scale * values[0], scale * deviations[0], unit)
 
 
 def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
@@ -423,8 +477,8 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str]) -> str:
     if check is None or not check.hidden_zeros:
         return ""
     names = [axes[axis] for axis in check.hidden_zeros]
-    subject = "The zeros of" if len(names) > 1 else "The zero of"
+    subject = "the zeros of" if len(names) > 1 else "the zero of"
     return (
-        f"{subject} {' and '.join(names)} cannot be seen here: about a vertical axis, or behind the last joint, "
+        f"These data do not show {subject} {' and '.join(names)}: about a vertical axis, or behind the last joint, "
         "another zero makes nearly the same torques."
     )

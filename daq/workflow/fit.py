@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from daq.config.policy import DEFAULT_APPLY_POLICY
 from daq.config.yaml_file import Fault
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
+from daq.files import sha256
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.diagnoses import (
@@ -31,6 +31,7 @@ from daq.workflow.diagnoses import (
     is_checked,
     named_causes,
     nameplate_of,
+    open_correction_diagnoses,
 )
 from daq.workflow.geometry_diagnoses import encoder_misfit_of
 from daq.workflow.validate import Corrections, diagnose_log, with_described
@@ -39,8 +40,8 @@ from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
-from ident.discovery.acceptance import accept_on_holdout
-from ident.discovery.before_after import error_on, holdout_change
+from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
+from ident.discovery.before_after import error_on
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.geometry_check import GeometryCheck
@@ -183,7 +184,7 @@ class Reading:
                 )
             self._corrections.note(log, run)
             # By its samples: a file that was rewritten is the same recording still.
-            content = hashlib.sha256(run.position_rad.tobytes() + run.current_a.tobytes()).hexdigest()
+            content = sha256(run.position_rad.tobytes() + run.current_a.tobytes())
             if content in self._seen:
                 raise LogRepeated(
                     str(log),
@@ -365,21 +366,49 @@ def judged(fitted: Fit) -> Fit:
 
 
 def with_description(fitted: Fit) -> Fit:
-    """Test the declared geometry beside a fit that has kept its rows; a search has tested it itself."""
+    """Test the declared geometry beside a fit that has kept its rows, unless it was tested before.
+
+    A search tests it again in each of its turns: gravity and the zeros that are hidden stay those of the fit before it.
+    """
     if fitted.description is not None or fitted.identification.gathered is None:
         return fitted
     evidence = fitted.steps[-1].after if fitted.steps else fitted.evidence()
     return replace(fitted, description=geometry_beside(evidence, BOOTSTRAP_SEED))
 
 
+def _with_description_after_search(closed: Fit) -> Fit:
+    """Keep the mistake that the fit before a search has named, unless the search has explained it.
+
+    It is explained by a correction, or by effects beside which the same test names it no more.
+    """
+    description = closed.description
+    if description is None or description.mistake is None:
+        return closed
+    after = closed.steps[-1].after
+    if PlacedEffect(description.mistake.effect, description.mistake.axis) in after.effects:
+        return replace(closed, description=replace(description, mistake=None))
+    if len(after.effects) == after.declared:  # the model is the one beside which it was named
+        return closed
+    beside = geometry_beside(after, BOOTSTRAP_SEED)
+    return replace(closed, description=replace(description, mistake=None if beside is None else beside.mistake))
+
+
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
-    """What a fit says of the declared geometry: corrections of its search, or else what the test beside it found."""
+    """Name what is wrong with the declared geometry, by the search of a fit and by the test beside it.
+
+    The same mistake of the same axis is said once.
+    """
+    found: list[Diagnosis] = []
     has_searched = any(not step.declared for step in fitted.steps)
     if has_searched:
-        return correction_diagnoses(fitted.steps[-1].after, fitted.cell)
-    if fitted.description is None:
-        return ()
-    return check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
+        found += correction_diagnoses(fitted.steps[-1].after, fitted.cell)
+        found += open_correction_diagnoses(fitted.steps, fitted.cell)
+    if fitted.description is not None:
+        found += check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
+    first: dict[tuple[str, tuple[str, ...]], Diagnosis] = {}
+    for one in found:
+        first.setdefault((one.name, one.axes), one)
+    return tuple(first.values())
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> EstimatorComparison:
@@ -427,7 +456,7 @@ def close_loop(
         IdentificationError: a refit failed.
     """
     described = start.estimate
-    start = with_corrected_geometry(start)
+    start = _with_geometry_of_encoders(start)
     known = start.steps  # with what the cell declares
     evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
@@ -443,16 +472,14 @@ def close_loop(
     steps = find_effects(evidence, rng, progress=progress, axes=places)
     if undecided is not Undecided.ALL_JOIN:
         join = undecided is Undecided.JOIN
-        steps = accept_on_holdout(evidence, steps, write_undecided=join, progress=progress, axes=places)
-    if start.geometry_covariance is not None:
-        last = replace(steps[-1], after=evidence_with_geometry(steps[-1].after, start.geometry_covariance))
-        steps = (*steps[:-1], last)
-    closed = replace(start, identification=before, steps=(*known, *steps))
+        steps = accept_on_holdout(evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places)
+    closed = _with_uncertain_geometry(replace(start, identification=before, steps=(*known, *steps)))
+    closed = _with_description_after_search(closed)
     with named_causes(closed.recordings):
         wrong = impossible_declared(closed.steps[-1].after, places)
         if wrong:  # the fit hoped for a correction of the geometry, and the search made none
             raise EffectImpossible(f"the declared {wrong}")
-        if closed.estimate is described:
+        if closed.estimate is described and not open_correction_diagnoses(closed.steps, closed.cell):
             return closed
         return judged(closed)
 
@@ -465,8 +492,30 @@ def with_corrected_geometry(start: Fit) -> Fit:
     Raises:
         DataError, IdentificationError: as for `fit`.
     """
+    if start.is_corrected:
+        return start
+    return _with_uncertain_geometry(_with_geometry_of_encoders(start))
+
+
+def _with_uncertain_geometry(found: Fit) -> Fit:
+    """Add the uncertainty of the corrected geometry to estimates that have none of it; the same fit without one."""
+    covariance = found.geometry_covariance
+    if covariance is None:
+        return found
+    unknowns = found.identification.estimate.unknowns
+    return replace(
+        found,
+        identification=with_geometry_covariance(found.identification, covariance),
+        steps=tuple(
+            replace(step, after=evidence_with_geometry(step.after, covariance, unknowns)) for step in found.steps
+        ),
+    )
+
+
+def _with_geometry_of_encoders(start: Fit) -> Fit:
+    """Identify again with the geometry of the encoders, and leave its uncertainty to be added after a search."""
     finding = start.geometry
-    if finding is None or not finding.corrections or start.is_corrected:
+    if finding is None or not finding.corrections:
         return start
     cell = start.cell
     model = model_of(cell)
@@ -484,7 +533,6 @@ def with_corrected_geometry(start: Fit) -> Fit:
         axes=cell.axis_names,
     )
     covariance = geometry_covariance(result, model, finding)
-    result = with_geometry_covariance(result, covariance)
     steps = with_effects_of_cell(result, effects, cell.place_names)
     last = steps[-1].after.identification if steps else result
     return replace(
@@ -497,9 +545,10 @@ def with_corrected_geometry(start: Fit) -> Fit:
 
 
 def check_holdout(fitted: Fit) -> None:
-    """Refuse effects that raise the error of held-out runs by more than its noise.
+    """Refuse effects that raise the error of held-out runs by more than its noise, in total or of a motor.
 
-    `close_loop` has taken out what held-out runs refute; this refuses a fit that was made in another way.
+    `close_loop` has taken out what held-out runs refute, by the same comparison; this refuses a fit that was made in
+    another way. Effects that the cell declares are in both models that are compared.
 
     Raises:
         EffectsRefuted: they do, and the operator has not accepted it.
@@ -507,9 +556,13 @@ def check_holdout(fitted: Fit) -> None:
     if not fitted.steps or fitted.accept_worse_holdout:
         return
     after = fitted.steps[-1].after
-    before = without_effects(after, fitted.identification.estimate)
-    change = holdout_change(before, after)
-    if change is None or not change.is_rise:
+    declared = [step.after for step in fitted.steps if step.declared]
+    before = declared[-1] if declared else without_effects(after, fitted.identification.estimate)
+    if after.holdout is None or after.effects == before.effects:
+        return
+    change = compare_on_holdout(before, before, after)
+    harm = change.harm("held-out runs")
+    if not harm:
         return
     weights_nm_a = before.estimate.gains
     first, last = (
@@ -521,10 +574,10 @@ def check_holdout(fitted: Fit) -> None:
     cold = [one.name for one in unseen if one.temperature_c is None]
     needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
     raise EffectsRefuted(
-        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects),
+        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects[after.declared :]),
         found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
         + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
-        expected=f"no rise by more than its noise over their {change.moves} moves",
+        expected=f"no rise by more than its noise over their {change.total.moves} independent blocks of moves; {harm}",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record more runs for "
         "the fit (or pass --accept-worse-holdout to `drivegain residual`)",
     )
@@ -571,7 +624,7 @@ def _calibration(fitted: Fit) -> Calibration:
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
-    """Hold-out error with the nameplate's gains: same model, effects included, parameters refitted.
+    """Hold-out error with the nameplate gains: same model, effects included, parameters refitted.
 
     Without the effects, their share would be credited to the gains. The total weighs the axes by ‖Y_j‖ of the
     calibration, because smaller gains alone would lower it otherwise.

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from daq.config.cell import Cell, CellAxis, model_of
+from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text, zero_remedy
 from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
 from ident.errors import Diagnosis, ModelError
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
@@ -108,30 +109,33 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 
 
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
-    """Say how far a number is off: `a zero of M2 that is off by -0.102 ± 0.003 deg`."""
+    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its position)`."""
     if one.parameter.kind is GeometryKind.ZERO:
         axis = _axis_of(one.parameter, cell)
-        size = _size_text(-one.change, one.std, axis.unit.si)
-        return f"a zero of {axis.name} that is off by {size} {axis.unit.name}"
+        return zero_off_text(axis.name, one.change / axis.unit.si, one.std / axis.unit.si, _unit_of_zero(axis))
     longer = "longer" if one.change > 0.0 else "shorter"
-    size = _size_text(abs(one.change), one.std, 1e-3, sign="")
+    size = _size_text(abs(one.change), one.std, 1e-3)
     return f"a {one.parameter.name} that is {size} mm {longer} than described"
 
 
-def _size_text(value: float, std: float, unit_si: float, sign: str = "+") -> str:
+def _unit_of_zero(axis: CellAxis) -> str:
+    """Unit of an axis' zero, as people write it."""
+    return DEGREES if axis.unit.si_name == "rad" else MILLIMETRES
+
+
+def _size_text(value: float, std: float, unit_si: float) -> str:
     """Write a size with σ, to a figure that a description can hold."""
     shown_std = max(std / unit_si, 5e-5)
-    return f"{value / unit_si:{sign}.4f} ± {shown_std:.4f}"
+    return f"{value / unit_si:.4f} ± {shown_std:.4f}"
 
 
 def _remedy(one: GeometryEstimate, cell: Cell) -> str:
     if one.parameter.kind is GeometryKind.ZERO:
         axis = _axis_of(one.parameter, cell)
-        amount = f"{one.change / axis.unit.si:+.4f}"
-        return (
-            f"add {amount} {axis.unit.name} to `zero_offset_{axis.unit.name}` of {axis.name} in the cell file, or "
-            "correct the zero in the controller"
-        )
+        change = one.change / axis.unit.si
+        std = one.std / axis.unit.si
+        described = axis.zero_offset_rad / axis.unit.si
+        return zero_remedy(axis.name, change, std, _unit_of_zero(axis), described)
     length_m = described_length(model_of(cell).robot, one.parameter)
     right = f"{1e3 * (length_m + one.change):.3f} mm in place of {1e3 * length_m:.3f} mm"
     return f"correct the {one.parameter.name} in the URDF: {right}"

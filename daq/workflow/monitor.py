@@ -30,8 +30,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import read_scale
 from drivers.errors import DriverError
 from drivers.messages import CellEvent, EventKind, Sample
-from drivers.profiles.cia402 import FAULTY, decode
-from drivers.stream.monitor import READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
+from drivers.stream.monitor import READING_S, CellMonitor, CellReading, ReadingSource
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
@@ -157,7 +156,7 @@ class CellWatch:
             if self._facts is not None:
                 self._feed.event(event)
         for number, axis in enumerate(reading.axes):
-            if not _in_fault(axis):
+            if not axis.in_fault:
                 self._codes.pop(number, None)
 
     def _query(self, reading: CellReading) -> None:
@@ -174,7 +173,7 @@ class CellWatch:
                 with suppress(DriverError):  # its current stays a raw number, and is shown as one
                     access = self._network.link.objects(axis.node_id)
                     self._ampere[number] = read_scale(access, axis.profile).ampere_per_unit
-            if _in_fault(found) and number not in self._codes:
+            if found.in_fault and number not in self._codes:
                 self._monitor.pause()
                 self._codes[number] = read_error_code(self._network.link.objects(axis.node_id))
                 self._publish_fault(number)
@@ -310,7 +309,3 @@ def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     joint = scale.joint_position(np.array([axis.position_counts or 0 for axis in reading.axes]))
     known = scale.joints_known(~unknown)
     return [float(value) if shown else None for shown, value in zip(known, joint, strict=True)]
-
-
-def _in_fault(axis: AxisReading) -> bool:
-    return axis.statusword is not None and decode(axis.statusword) in FAULTY

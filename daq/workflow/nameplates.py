@@ -1,4 +1,4 @@
-"""Compare the nameplate gains of a cell with the controller's file, and with the motors' data in the drives.
+"""Compare the nameplate gains of a cell with the current gains, and with the motors' data in the drives.
 
 A mistyped nameplate is found before anything moves. What tolerances and gear losses can explain is a warning at most.
 """
@@ -6,6 +6,7 @@ A mistyped nameplate is found before anything moves. What tolerances and gear lo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from daq.config.cell import Cell, CellAxis
@@ -13,16 +14,23 @@ from daq.config.yaml_file import Fault, fault_texts, parse_yaml
 from daq.config.yaml_file import read_yaml_bytes as read_configuration
 from daq.errors import ConfigurationInconsistent, ControllerUnfit
 from daq.formats.document import decode_document, read_controller_file
-from drivers.canopen.scale import ScaleReading, check_name_plate
+from drivers.canopen.scale import ScaleReading, check_nameplate
 from drivers.profiles.profile import TapPoint
 from ident.model.model import DriveTrain
 from ident.plausible import NAMEPLATE_RATIO
 
-Reference = tuple[float, str]  #: a gain of an axis from elsewhere, in the unit of its nameplate, and its source
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What a nameplate is compared with: the current gain, or N·Kt of the motor's data in the drive."""
+
+    gain: float  #: in the unit of the nameplate
+    name: str  #: what it is, in words
+    source: str  #: where it was read
 
 
 def check_controller(cell_file: Path, cell: Cell) -> None:
-    """Compare each nameplate with the gain in the controller's file.
+    """Compare each nameplate with the current gain in the controller's file.
 
     A file that cannot be read, or without such a number, is left to `drivegain apply`: there need not be one before.
 
@@ -41,13 +49,15 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
         numbers = decode_document(read_controller_file(file), str(file), controller.format).locate(controller.keys)
     except ControllerUnfit:
         return
-    gains = [number.value / factor for number, factor in zip(numbers, controller.factors, strict=True)]
-    sources = [f"by {file.name}, line {number.line}" for number in numbers]
-    _require_alike(cell_file, cell, list(zip(gains, sources, strict=True)))
+    current_gains = [
+        Reference(number.value / factor, "the current gain", f"{file.name}, line {number.line}")
+        for number, factor in zip(numbers, controller.factors, strict=True)
+    ]
+    _require_alike(cell_file, cell, current_gains)
 
 
 def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading | None]) -> None:
-    """Compare each nameplate with the controller's gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
+    """Compare each nameplate with the current gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
 
     Args:
         cell_file: file of the cell, for the lines.
@@ -64,8 +74,8 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
         if reading is None or constant is None or not _comparable(axis):
             references.append(None)
             continue
-        source = f"by N·Kt of the drive's motor ({reading.rated_torque_nm} Nm / {reading.rated_current_a} A)"
-        references.append((constant * abs(float(reduction)), source))
+        source = f"{reading.rated_torque_nm} Nm / {reading.rated_current_a} A"
+        references.append(Reference(constant * abs(float(reduction)), "N·Kt of the drive's motor", source))
     _require_alike(cell_file, cell, references)
 
 
@@ -84,7 +94,7 @@ def nameplate_warnings(cell: Cell, readings: Sequence[ScaleReading | None]) -> t
         if axis.profile is None or not _comparable(axis):
             found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
         else:
-            found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
+            found += check_nameplate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
         for warning in found:
             axes_by_warning.setdefault(warning, []).append(axis.name)
     note = actual_current_note(cell)
@@ -113,17 +123,20 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
     """Refuse nameplates whose size is beyond NAMEPLATE_RATIO of a reference; signs are compared before a write."""
     wrong: dict[int, Reference] = {}
     for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True)):
-        if reference is not None and not _alike(axis.nameplate_gain, reference[0]):
+        if reference is not None and not _alike(axis.nameplate_gain, reference.gain):
             wrong[index] = reference
     if not wrong:
         return
     document = parse_yaml(read_configuration(cell_file), str(cell_file))
     faults = []
-    for index, (gain, source) in wrong.items():
+    for index, reference in wrong.items():
         axis = cell.axes[index]
         keys = document.tree["axes"][index]
         key = next(key for key in keys if key.startswith("nameplate_gain"))
-        found = f"{axis.nameplate_gain:g} {axis.gain_unit}, while it is {gain:.4g} {source}"
+        found = (
+            f"{axis.nameplate_gain:g} {axis.gain_unit}, while {reference.name} is {reference.gain:.4g} "
+            f"({reference.source})"
+        )
         faults.append(Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}"))
     raise ConfigurationInconsistent(
         **fault_texts(document, faults),

@@ -7,6 +7,7 @@ so a proposal costs two small sums and one factorisation; the regressors of a wh
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -20,8 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
-from daq.config.document_kind import DocumentKind
-from daq.config.yaml_file import StrictModel, parse_yaml, read_model, read_yaml_bytes
+from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
@@ -62,6 +62,7 @@ class Plan:
     duration_s: float
     moves: tuple[PlannedMove, ...]  #: in order
     units: tuple[JointUnit, ...]  #: in which people read the targets, one a joint
+    purpose: str = ""  #: what it was planned for, in words for its page; empty for a first plan, which is for all gains
 
 
 DWELL_S = 0.1
@@ -145,6 +146,7 @@ class Search:
         largest_condition: float,
         goal: PlanGoal,
         box: TargetBox,
+        allowed: TargetBox,
     ) -> None:
         self._experiment = experiment
         self._cell = experiment.cell
@@ -155,6 +157,7 @@ class Search:
         self._goal = goal
         self._low = box.lower
         self._high = box.upper
+        self._allowed = allowed
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
@@ -331,11 +334,9 @@ class Search:
         )
 
     def _is_within(self, move: PlannedMove) -> bool:
-        """Whether the joints' limits allow a target; the motors of a redundant drive were moved to fit each other."""
-        return all(
-            axis.limits.position[0] <= target <= axis.limits.position[1]
-            for axis, target in zip(self._cell.axes, move.target_rad, strict=True)
-        )
+        """Whether a target is allowed; the motors of a redundant drive were moved to fit each other."""
+        target = np.array(move.target_rad)
+        return bool(np.all((target >= self._allowed.lower) & (target <= self._allowed.upper)))
 
     def _written(self, target: FloatArray) -> tuple[float, ...]:
         """As the plan file will say it: what is judged is what is made."""
@@ -456,7 +457,8 @@ def plan(
         largest_condition = LARGEST_CONDITION if cell.chain is None else LARGEST_CONDITION_OF_CHAIN
     goal = goal or PlanGoal.of_first(experiment.design)
     room = _room(cell, duration_s, box)
-    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition, goal, room)
+    allowed = _allowed_targets(cell, box)
+    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition, goal, room, allowed)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
     information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
     predicted = experiment.design.std_percent(information)
@@ -541,6 +543,15 @@ def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
     return room
 
 
+def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
+    """Return where targets may be: within the joint limits, and within a box but for the rounding of a plan file."""
+    limits = JointLimits.of(cell)
+    if box is None:
+        return TargetBox(limits.lower, limits.upper)
+    rounding = np.array([axis.unit.si for axis in cell.axes]) * 10.0**-PLACES
+    return TargetBox(np.maximum(limits.lower, box.lower - rounding), np.minimum(limits.upper, box.upper + rounding))
+
+
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
     """The same ways at a share of their speed, as for a first run; the predictions are those of the plan as made."""
     moves = tuple(
@@ -581,6 +592,7 @@ class _Plan(StrictModel):
     condition: Annotated[float, Field(gt=0)]
     # Plans of earlier versions have none.
     predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    purpose: str = ""
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
 
 
@@ -611,6 +623,9 @@ def save_plan(plan: Plan, path: Path) -> None:
     """
     key = _key(plan.units)
     predicted = ", ".join(f"{value:.3f}" for value in plan.predicted_std_percent)
+    recorded = "moves made without load and with the payload"
+    if plan.purpose:
+        recorded = "all blocks of the session and these moves together"
     lines = [
         "# Synchronised point-to-point moves; velocity and acceleration are shares of the joint limits.",
         f"# Targets: {', '.join(unit.name for unit in plan.units)}.",
@@ -618,9 +633,11 @@ def save_plan(plan: Plan, path: Path) -> None:
         f"cell: {plan.cell}",
         f"seed: {plan.seed}",
         f"condition: {plan.condition:.1f}    # of the weighted observation matrix",
-        f"predicted_std_percent: [{predicted}]    # of each gain, moves made without load and with the payload",
-        "moves:",
+        f"predicted_std_percent: [{predicted}]    # of each gain, {recorded}",
     ]
+    if plan.purpose:
+        lines.append(f"purpose: {json.dumps(plan.purpose)}")  # a string of JSON is one of YAML
+    lines.append("moves:")
     for move in plan.moves:
         target = ", ".join(f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True))
         lines.append(
@@ -660,6 +677,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         duration_s=duration_s,
         moves=moves,
         units=tuple(axis.unit for axis in cell.axes),
+        purpose=model.purpose,
     )
 
 

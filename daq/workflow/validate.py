@@ -273,7 +273,7 @@ def warn_without_temperature(calibration: Calibration, name: str, temperature_c:
             )
 
 
-MANUFACTURER = "manufacturer"  #: Label of the nameplate gains
+NAMEPLATE_LABEL = "manufacturer"  #: Label of the nameplate gains, a key of documents that stays
 
 
 @dataclass(frozen=True, slots=True)
@@ -461,7 +461,7 @@ def _masses(
     has_nameplate = any(_gains(one).tolist() == nameplate for one in sets.values())
     if isinstance(rows, RowsToWeigh) and rows.bare and not has_nameplate:
         entered = tuple(replace(gain, value=gain.nameplate, std=0.0) for gain in first.gains)
-        sets = {MANUFACTURER: replace(first, gains=entered, covariance_factor=None), **sets}
+        sets = {NAMEPLATE_LABEL: replace(first, gains=entered, covariance_factor=None), **sets}
     masses: dict[str, Mass | str] = {}
     for label, calibration in sets.items():
         if isinstance(rows, str):

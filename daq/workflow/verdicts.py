@@ -56,7 +56,7 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     extra: tuple[ExtraMoves, ...] = ()
     with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
         extra = extra_moves(experiment_of(fitted.cell))
-    judged = verdicts(design_after(fitted.identification), list(_excitations(fitted)), extra)
+    judged = verdicts(design_after(fitted.identification), list(excitations(fitted)), extra)
     true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
     return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
 
@@ -68,7 +68,8 @@ def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     return () if good else gain_verdicts(fitted)
 
 
-def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
+def excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
+    """Yield the motion of each log of a fit, with what was mounted; the logs are read again."""
     found = fitted.identification
     mountings = [payload.mounting for payload in found.system.payloads]
     for run in fitted.runs(fitted.logs):

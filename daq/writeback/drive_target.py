@@ -1,7 +1,7 @@
 """The drives of a cell as a target: one object in each drive holds the gain of its axis.
 
 `drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. A record of the write,
-with the values before it, is on the disk before the first drive is touched. It is called <time>.json and is never
+with the previous gains, is on the disk before the first drive is touched. It is called <time>.json and is never
 changed. It carries the digest of its content: a rollback writes its numbers back into the drives.
 """
 
@@ -20,8 +20,7 @@ from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
-from daq.config.document_kind import DocumentKind
-from daq.config.yaml_file import StrictModel
+from daq.config.yaml_file import DocumentKind, StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.fold import drives_of
@@ -49,8 +48,8 @@ class DriveNote(StrictModel):
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: index of the object that was to be written
     subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: its subindex
     type: ParameterKind  #: its data type
-    old: _U32  #: its bits before the write
-    new: _U32  #: its bits as they were to be
+    old: _U32  #: bits of the previous gain
+    new: _U32  #: bits of the gain that was to be written
 
     @property
     def parameter(self) -> DriveParameter:
@@ -147,7 +146,7 @@ def _unfit(path: Path, found: str) -> ControllerUnfit:
         str(path),
         found=found,
         expected="the record of a write to drives, as drivegain wrote it",
-        remedy="nothing was written; enter the old gains with the drives' own tool",
+        remedy="nothing was written; enter the previous gains with the drives' own tool",
     )
 
 
@@ -159,7 +158,7 @@ class DriveEdit(Edit):
     """Planned change of the drives of a cell."""
 
     folder: Path  #: of the records
-    values: tuple[ParameterValue, ...]  #: in the drives now
+    values: tuple[ParameterValue, ...]  #: current gains in the drives
     writes: tuple[ParameterWrite, ...]  #: values to be written
     record: DriveRecord | None = None  #: of the write that a rollback undoes; None for a calibration
 
@@ -167,6 +166,15 @@ class DriveEdit(Edit):
     def place(self) -> Path:
         """The folder of the records."""
         return self.folder
+
+    @property
+    def diff(self) -> str:
+        """A line for each drive: its object, its value now, and the one to be written."""
+        lines = [
+            f"{change.key}: {value.value:.9g} -> {change.spelling}\n"
+            for change, value in zip(self.changes, self.values, strict=True)
+        ]
+        return "".join(lines)
 
     @property
     def has_effect(self) -> bool:
@@ -237,7 +245,7 @@ class DriveTarget:
         for path in reversed(paths):
             record = read_record(path)
             base = read_parameters(self.network, self._recorded(path, record))
-            # A writer that was killed before its first write leaves a record of the present values.
+            # A writer that was killed before its first write leaves a record of the current gains.
             if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
                 continue
             _check_untouched(path, record, base)
@@ -257,7 +265,7 @@ class DriveTarget:
             )
         raise CalibrationRefused(
             self.subject,
-            found=f"{counted(len(paths), 'record')} of the present values" if paths else f"no record in {folder}",
+            found=f"{counted(len(paths), 'record')} of the current gains" if paths else f"no record in {folder}",
             expected="the record of a write that changed them",
             remedy="nothing was written",
         )
@@ -294,7 +302,7 @@ class DriveTarget:
             if content_of(found) != edit.before:
                 raise ControllerChanged(
                     edit.subject,
-                    found="other values in the drives, or other drives",
+                    found="other current gains in the drives, or other drives",
                     expected="those that the change was planned for",
                     remedy="take a new dry run; nothing was written",
                 )
@@ -393,7 +401,7 @@ def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tup
         if note is not None and value.word not in {note.old, note.new}:
             new = value.parameter.value(note.new)
             old = value.parameter.value(note.old)
-            expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before"
+            expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before that write"
             remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
             found.append((f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy))
     return tuple(found)
@@ -416,5 +424,5 @@ def _check_untouched(path: Path, record: DriveRecord, base: tuple[ParameterValue
                 found=f"{value.value:.9g}",
                 expected=f"{note.parameter.value(note.new):.9g} as drivegain wrote it, or "
                 f"{note.parameter.value(note.old):.9g} as before",
-                remedy=f"nothing was written: the gain was changed since; {path} has the old values",
+                remedy=f"nothing was written: the gain was changed since; {path} has the previous gains",
             )

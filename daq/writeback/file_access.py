@@ -58,7 +58,7 @@ def resolve_links(file: Path) -> Path:
 def require_existing(file: Path) -> None:
     """Refuse a symbolic link that leads nowhere, by that name, and a file of several names (hard links).
 
-    A new file takes the place of one name; a controller that reads another one would keep the old gains.
+    A new file takes the place of one name; a controller that reads another one would keep the current gains.
 
     Raises:
         ControllerUnfit: for either; see also `resolve_links`.
@@ -76,7 +76,7 @@ def require_existing(file: Path) -> None:
         raise ControllerUnfit(
             str(file),
             found=f"a file with {names} names (hard links)",
-            expected="one name: under the others the old gains would stay",
+            expected="one name: under the others the current gains would stay",
             remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of them, or give this name "
             f"a file of its own: cp -p {quoted} {quoted}.new && mv {quoted}.new {quoted}",
         )

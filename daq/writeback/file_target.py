@@ -36,6 +36,11 @@ class FileEdit(Edit):
     format: ControllerFormat | None = None  #: of the file; None where its name says it
 
     @property
+    def name(self) -> str:
+        """The file as it was named."""
+        return str(self.file)
+
+    @property
     def place(self) -> Path:
         """The file as it was named."""
         return self.file
@@ -210,7 +215,8 @@ class FileTarget:
             return {"restored": edit.source.name}
         changes = []
         for change in edit.changes:
-            numbers = {"old": change.old, "new": change.new, "std": change.std}
+            # "old" is the key of the current gain in every audit log.
+            numbers = {"old": change.current_gain, "new": change.new, "std": change.std}
             finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
             changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
         return {"changes": changes}

@@ -20,15 +20,15 @@ from ident.drift.change import DISPERSION, FALSE_ALARM, decide
 _LOG = logging.getLogger("drivegain")
 
 SAME_SIGMAS = 0.5
-"""A number in the controller's file that is as near to a gain of the history is that gain, rounded for the file."""
+"""A current gain that is as near to a gain of the history is that gain, rounded for the controller's file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
     """Figures of a history that a change is judged by; empty without a history."""
 
-    #: Σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken as
-    #: exact: a person entered that number, or the history does not have it.
+    #: σ of the current gains, by axis [unit of the gain]; a gain whose σ is missing, or 0, is taken as exact: a person
+    #: entered it, or the history does not have it.
     stds: Mapping[str, float] = field(default_factory=dict)
     #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a missing one.
     dispersions: Mapping[str, float] = field(default_factory=dict)
@@ -68,7 +68,7 @@ def query_history(
     try:
         history = read_history(ledger)
     except DaqError as error:
-        _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
+        _LOG.warning("the history cannot be read, so the current gains are taken as exact: %s", error)
         return NOTHING
     if history.may_lack:
         _LOG.warning(MAY_LACK)
@@ -76,19 +76,19 @@ def query_history(
 
 
 def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
-    """Return the figures of a history for the gains in a controller.
+    """Return the figures of a history for the current gains.
 
-    The σ of a gain is that of the calibration in force where the number is still that calibration's. Else it is that of
-    the newest calibration with this number: the history lacks a write after a kill, or when a backup was copied back by
-    hand. It is 0 for a number of no calibration, which a person entered.
+    The σ of a current gain is that of the calibration in force, if the gain is still that calibration's. Else it is
+    that of the newest calibration with this gain: the history lacks a write after a kill, or when a backup was copied
+    back by hand. It is 0 for a gain of no calibration, such as a nameplate, which a person entered.
 
-    The calibration that is judged, by its digest, is left out: a number that is near to it is another one unless it is
+    The calibration that is judged, by its digest, is left out: a gain that is near to it is another one unless it is
     in force, and the scatter is that of the others.
     """
     entries = history.entries
     in_force = history.in_force(target)
     others = [entry for entry in entries if entry.digest != digest]
-    gains = {change.axis: change.old for change in changes}
+    gains = {change.axis: change.compared_gain for change in changes}
     stds = dict.fromkeys(gains, 0.0)
     # Oldest first, then the one in force: the last one that fits counts.
     for entry in sorted(entries if in_force == digest else others, key=lambda entry: entry.digest == in_force):
@@ -106,11 +106,11 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
     comparable = [
         change
         for change in changes
-        if all(map(math.isfinite, (change.old, change.new, change.std))) and change.std >= 0.0
+        if all(map(math.isfinite, (change.compared_gain, change.new, change.std))) and change.std >= 0.0
     ]
     found = decide(
         tuple(change.axis for change in comparable),
-        [change.old for change in comparable],
+        [change.compared_gain for change in comparable],
         [known.stds.get(change.axis, 0.0) for change in comparable],
         [change.new for change in comparable],
         [change.std for change in comparable],
@@ -120,9 +120,15 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
     return dict(zip(found.axes, judged, strict=True)), found.words
 
 
-def noise_note(changes: Sequence[GainChange], known: Spread, old: str) -> str:
-    """Say what "more than noise" means for these changes; `old` names what they are from, such as "the nameplate"."""
-    exact = [change.axis for change in changes if not known.stds.get(change.axis)]
-    whose = "all axes" if len(exact) == len(changes) else ", ".join(exact)
-    taken = f"{old} taken as exact ({whose})" if exact else "σ of both"
-    return f"more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
+def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
+    """Say what "more than noise" means for these changes, all from the same kind of gain."""
+    exact = [change for change in changes if not known.stds.get(change.axis)]
+    taken = "σ of both gains is taken into account"
+    if exact:
+        listed = ", ".join(change.axis for change in exact)
+        whose = "all axes" if len(exact) == len(changes) else listed
+        taken = f"the {exact[0].compared_with.value} is taken as exact on {whose}"
+    return (
+        f"more than noise: the probability that noise alone makes such a change, on any axis, is below "
+        f"{100 * FALSE_ALARM:g} %; {taken}"
+    )

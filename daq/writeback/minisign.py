@@ -23,7 +23,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
-from daq.config.signers import KEY_ALGORITHM, UNTRUSTED, PublicKey, decode_line, shown_id
+from daq.config.policy import KEY_ALGORITHM, UNTRUSTED, PublicKey, decode_line, shown_id
 
 TRUSTED = "trusted comment: "
 _PREHASHED = b"ED"

@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from enum import Enum
 from pathlib import Path
 
 from daq.config.policy import ApplyPolicy
@@ -62,35 +63,52 @@ class Request:
         }
 
 
+class GainOrigin(Enum):
+    """Origin of the gain that a new one is compared with; the value is the word for it in messages."""
+
+    CURRENT = "current gain"  #: what the controller has
+    NAMEPLATE = "nameplate"  #: from the data sheet, as the cell file has it
+    PREVIOUS = "previous gain"  #: what the controller had before the last write
+    EARLIER = "earlier calibration"  #: from another calibration of the cell
+
+
 @dataclass(frozen=True, slots=True)
 class GainChange:
-    """One gain before and after."""
+    """A new gain beside the one that it is compared with: in a planned write, the current gain."""
 
     axis: str  #: name of the axis
     key: str  #: place of the number: its key in the controller file, or the drive's object
     line: int  #: of the number in the file, from 1; 0 in a drive
-    old: float  #: gain now [unit]
+    compared_gain: float  #: gain that the new one is compared with [unit]; `compared_with` says which
     new: float  #: gain as it will be read back [unit], NaN where there is none to write
     std: float  #: standard deviation of the identified gain [unit]
     unit: str  #: Nm at the joint per unit of the current-loop reference
-    nameplate: float  #: the manufacturer's gain [unit]
+    nameplate_gain: float  #: gain of the data sheet [unit]
     spelling: str  #: the new number as written, in the controller's own unit; empty where none can be written
+    compared_with: GainOrigin = GainOrigin.CURRENT
 
     @classmethod
-    def of(cls, gain: Gain, key: str, line: int, old: float, planned: tuple[float, str] | None) -> GainChange:
+    def of(cls, gain: Gain, key: str, line: int, current_gain: float, planned: tuple[float, str] | None) -> GainChange:
         """Make the change of one gain; `planned` is `new` and `spelling`, None where there is none to write."""
         new, spelling = planned or (gain.value, "")
-        return cls(gain.axis, key, line, old, new, gain.std, gain.unit, gain.nameplate, spelling)
+        return cls(gain.axis, key, line, current_gain, new, gain.std, gain.unit, gain.nameplate, spelling)
+
+    @property
+    def current_gain(self) -> float:
+        """Gain that the controller has [unit]; NaN where the new one is compared with another gain."""
+        if self.compared_with is not GainOrigin.CURRENT:
+            return math.nan
+        return self.compared_gain
 
     @property
     def change_percent(self) -> float:
-        """Change from the gain in the controller [%]; inf from zero."""
-        return _percent(self.new - self.old, self.old)
+        """Change from the gain that is compared [%]; inf from zero."""
+        return _percent(self.new - self.compared_gain, self.compared_gain)
 
     @property
     def nameplate_percent(self) -> float:
-        """Distance from the nameplate [%]; inf from zero."""
-        return _percent(self.new - self.nameplate, self.nameplate)
+        """Change from the nameplate [%]; inf from zero."""
+        return _percent(self.new - self.nameplate_gain, self.nameplate_gain)
 
     @property
     def std_percent(self) -> float:
@@ -111,6 +129,16 @@ class Edit:
     changes: tuple[GainChange, ...] = ()  #: one for each gain, in the order of the calibration; none in a rollback
     unexpected: tuple[GateFinding, ...] = ()  #: where the content now is not the one that drivegain expects there
     source: Path | None = None  #: backup or record that a rollback restores; None for a calibration
+
+    @property
+    def name(self) -> str:
+        """The target as the cell names it."""
+        return self.subject
+
+    @property
+    def diff(self) -> str:
+        """The change as text, empty where there is none."""
+        return ""
 
     @property
     def place(self) -> Path:

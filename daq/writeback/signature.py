@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
-from daq.config.signers import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
+from daq.config.policy import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
 from daq.config.yaml_file import read_file
 from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError, reason_of
 from daq.files import read_regular, replace_file

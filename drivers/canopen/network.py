@@ -413,7 +413,7 @@ class CanopenNetwork:
         return tuple(reading.ampere_per_unit for reading in self.scales())
 
     def scales(self) -> tuple[ScaleReading, ...]:
-        """Return the current scale and motor name plate in each drive, read once.
+        """Return the current scale and the motor's rated values in each drive, read once.
 
         Raises:
             ObjectAccessError, SetupRefused: as `drivers.canopen.scale.read_scale`.

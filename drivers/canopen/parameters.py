@@ -1,8 +1,8 @@
 """Read and write parameters in the drives of a cell while no axis has power: all of them or none.
 
 Nothing moves: no NMT command, no PDO and no controlword is sent. Each write is read back and, where requested, saved.
-After a failure the old values are restored in every drive that was touched. A save may store more than the parameter:
-where it would store the PDO mapping, that must not be a mapping which a recording left behind.
+After a failure the previous values are restored in every drive that was touched. A save may store more than the
+parameter: where it would store the PDO mapping, that must not be a mapping which a recording left behind.
 """
 
 from __future__ import annotations
@@ -103,14 +103,14 @@ def write_parameters(
         network: open, and not prepared for recording.
         writes: at most one an axis; the network's own axes define how an axis saves.
         saving: whether the drives save.
-        begin: called with the old values after all checks and before the first write; an exception stops the write.
+        begin: called with the previous values after all checks and before the first write; an exception stops it.
 
     Raises:
         ParameterRefused: an axis has power (checked before and after each write), a drive cannot save, or a value reads
-            back differently. The old values are in force.
-        BusBusy, NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py; the old values are in
-            force.
-        ParametersMixed: as these, and the old values could not be restored everywhere.
+            back differently. The previous values are in force.
+        BusBusy, NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py; the previous values are
+            in force.
+        ParametersMixed: as these, and the previous values could not be restored everywhere.
     """
     axes = {axis.node_id: axis for axis in network.axes}
     writes = [replace(write, axis=axes[write.axis.node_id]) for write in writes]
@@ -233,7 +233,7 @@ def _undo(
     saved: Sequence[Axis],
     error: BaseException,
 ) -> None:
-    """Restore the old values, and save them where the new ones may have been saved; ParametersMixed if not all are."""
+    """Restore the previous values, and save them where new ones may have been saved; ParametersMixed if not all are."""
     restored = []
     problems = []
     try:
@@ -250,7 +250,7 @@ def _undo(
     if problems and tried:
         raise ParametersMixed(tuple(restored), tuple(problems)) from error
     if restored:
-        error.add_note(f"kept: the old values are restored in {', '.join(restored)}")
+        error.add_note(f"kept: the previous values are restored in {', '.join(restored)}")
 
 
 def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool) -> None:

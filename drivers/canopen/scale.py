@@ -1,7 +1,7 @@
-"""The ampere value of a drive's raw unit, read at connect and compared with the motor's name plate.
+"""The ampere value of a drive's raw unit, read at connect and compared with the motor's rated values.
 
 A gain is Nm per ampere. A wrong ampere value passes every later check and makes all gains of the axis wrong by one
-factor, so it is compared with the motor data in the drive and with the name plate in the cell configuration.
+factor, so it is compared with the motor's rated values in the drive and with the nameplate in the cell configuration.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
-            remedy = "the drive was not set up for its motor; its current has no scale: enter the motor's name plate"
+            remedy = (
+                "the drive was not set up for its motor, so its current has no scale: enter the motor's rated current "
+                "and torque in the drive"
+            )
             raise implausible(f"{name} = {value}", "the motor's rated value", remedy)
     choice = 0 if scale.switch is None else access.read(scale.switch)
     try:
@@ -64,7 +67,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
         raise implausible(f"{scale.switch} = {choice}", f"0 to {len(scale.weights) - 1}", remedy) from error
     if scale.switch is not None:
         values[str(scale.switch)] = choice
-    rated_a, rated_nm, warnings = _name_plate(access, profile)
+    rated_a, rated_nm, warnings = _read_rated(access, profile)
     if rated_a is not None:
         if not SMALLEST_RATED_A <= rated_a <= LARGEST_RATED_A:
             expected = f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A"
@@ -81,12 +84,12 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     return ScaleReading(ampere, values, rated_a, rated_nm, warnings)
 
 
-def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:
-    """Compare the drive's Kt = rated torque / rated current with the cell's, |nameplate gain / N|.
+def check_nameplate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:
+    """Compare the drive's Kt = rated torque / rated current with that of the nameplate, |nameplate gain / N|.
 
     Args:
         reading, amplitude: of the drive, and of its profile.
-        motor_nm_per_a: torque constant of the motor by the cell configuration [Nm/A], sign irrelevant.
+        motor_nm_per_a: torque constant of the motor by the nameplate [Nm/A], sign irrelevant.
 
     Returns:
         Warnings for a poor fit; none where the drive does not report both values, of which the reading warns.
@@ -98,18 +101,18 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     ratio = reported / declared
     evidence = (
         f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / {reading.rated_current_a:g} A), "
-        f"{declared:.4g} Nm/A by the cell's nameplate gain, {ratio:.3g} times"
+        f"{declared:.4g} Nm/A by the nameplate in the cell file, {ratio:.3g} times"
     )
     if 1.0 / FINE < ratio < FINE:
         return ()
     if any(abs(math.log(ratio * root)) < math.log(1.08) for root in (math.sqrt(2.0), math.sqrt(0.5))):
         hint = f"near √2: one of them counts peak and the other RMS ampere (this profile: {amplitude.value})"
     else:
-        hint = "another motor, or a wrong name plate"
+        hint = "another motor, or a wrong nameplate"
     return (f"torque constants differ: {evidence}; {hint}",)
 
 
-def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | None, float | None, tuple[str, ...]]:
+def _read_rated(access: ObjectAccess, profile: DriveProfile) -> tuple[float | None, float | None, tuple[str, ...]]:
     """Read rated current [A] and torque [Nm] of the motor, None where the drive reports none, and warnings."""
     if profile.rated is None:
         return None, None, (f"profile {profile.name} has no rated current; the ampere cannot be checked",)

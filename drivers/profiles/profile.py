@@ -105,7 +105,7 @@ class CurrentScale:
 
 @dataclass(frozen=True, slots=True)
 class RatedMotor:
-    """Objects of the motor's name plate in a drive, against which ampere values are checked."""
+    """Objects of the motor's rated values in a drive, against which ampere values are checked."""
 
     current: ObjectEntry  #: rated current
     ampere_per_unit: float = 1e-3  #: its unit (6075h: 1e-3)
@@ -154,7 +154,7 @@ class DriveProfile:
     save_semantics: str  #: content of a save, in words; it decides what must be restored before a save
     source: str  #: documents, in short
     facts: tuple[Fact, ...] = ()  #: the same for each key of the profile
-    rated: RatedMotor | None = None  #: the motor's name plate in the drive, None where it has none
+    rated: RatedMotor | None = None  #: the motor's rated values in the drive, None where it has none
     save: Save | None = None  #: command that saves, None where there is none or it is unknown
     #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none: then frozen
     #: data show as values that do not change in a move (drivers/stream/watch.py).

@@ -20,6 +20,7 @@ from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
 from drivers.canopen.split_bus import FROM_NODES, SplitAddress
 from drivers.messages import CellEvent, Sample
+from drivers.profiles.cia402 import FAULTY, decode
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
 
@@ -62,6 +63,11 @@ class AxisReading:
     def is_late(self) -> bool:
         """Whether an answer took longer than `ANSWER_S`."""
         return self.delay_s is not None and self.delay_s > ANSWER_S
+
+    @property
+    def in_fault(self) -> bool:
+        """Whether its last statusword reports a fault."""
+        return self.statusword is not None and decode(self.statusword) in FAULTY
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,14 @@ of proof is on the effect:
    all of it leaves.
 
 Effects that the cell declares are not judged: it is known that they are there.
+
+What left undecided may be true, and σ of the gains contains what it would move (`ident.discovery.choice`). What is left
+must pass the gates of the search again (`ident.discovery.loop.end_search`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +43,7 @@ def accept_on_holdout(
     steps: Sequence[Step],
     *,
     gates: Gates | None = None,
+    rng: np.random.Generator | None = None,
     write_undecided: bool = False,
     progress: Callable[[str], None] = lambda _: None,
     axes: Sequence[str] = (),
@@ -50,6 +54,7 @@ def accept_on_holdout(
         start: the model that the search began with, with the effects that the cell declares.
         steps: of `find_effects`, from there.
         gates: limits of the search.
+        rng: of the bootstrap, by which what is left is tested again; one with the seed 0 when None.
         write_undecided: keep effects that held-out runs neither confirm nor refute.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
@@ -69,6 +74,7 @@ def accept_on_holdout(
     names = axes or [joint.name for joint in start.model.robot.places]
     verdicts: dict[PlacedEffect, EffectVerdict] = {}
     judged_model = found
+    bootstrap = rng or np.random.default_rng(0)
     last = steps[-1]
     while True:
         left = _judged(start, judged_model, verdicts, write_undecided=write_undecided, progress=progress, names=names)
@@ -76,8 +82,12 @@ def accept_on_holdout(
             refitted = start
             if left is not start:
                 refitted = replace(with_effects(found, left.effects), declared=found.declared)
-            last = end_search(steps, linearised(refitted, ColumnCache()), gates or Gates())
-        # An effect that the σ of this fit no longer shows has left: those beside it are judged again without it.
+            opened = dict.fromkeys((*last.left_open, *_undecided(found, left, verdicts)))
+            dropped = last.set_aside[len(steps[-1].set_aside) :]
+            model = linearised(refitted, ColumnCache())
+            last = end_search(steps, model, gates or Gates(), rng=bootstrap, left_open=tuple(opened))
+            last = replace(last, set_aside=(*last.set_aside, *dropped))
+        # An effect that passes no longer in this fit has left: those beside it are judged again without it.
         if len(last.after.effects) >= len(left.effects):
             break
         judged_model = last.after
@@ -86,6 +96,18 @@ def accept_on_holdout(
         replace(verdicts[placed], written=placed in written) for placed in found.effects if placed in verdicts
     )
     return (*steps[:-1], replace(last, verdicts=ordered))
+
+
+def _undecided(
+    found: Evidence, left: Evidence, verdicts: Mapping[PlacedEffect, EffectVerdict]
+) -> tuple[PlacedEffect, ...]:
+    """Effects that a search has found, and that left although held-out runs do not refute them."""
+    undecided: list[PlacedEffect] = []
+    for placed in found.effects:
+        verdict = verdicts.get(placed)
+        if verdict is not None and verdict.judgement is Judgement.UNDECIDED and placed not in left.effects:
+            undecided.append(placed)
+    return tuple(undecided)
 
 
 def _judged(

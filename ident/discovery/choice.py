@@ -13,7 +13,9 @@ weights. They are
 - for each effect in the fit, those of its ambiguity set in its place;
 - for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and possible, but too
   small for the other gates: a saturation that explains 3 % of the residual may move a gain by five σ. A term without a
-  name that did not join because it moves a gain is one of them.
+  name that did not join because it moves a gain is one of them;
+- each effect that left although nothing refutes it: held-out runs decide nothing, or σ itself hides it. No other model
+  takes a part of its weight, because the gains of a model with it are what they would be if it is true.
 
 θ_r is taken to first order, from products with columns that the search has made before: no refit. The error of the
 settings that were searched (exponents, time constants) is left out: it was below a tenth of σ wherever it was measured.
@@ -22,6 +24,7 @@ settings that were searched (exponents, time constants) is left out: it was belo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
@@ -31,6 +34,7 @@ from ident.discovery.candidates import SearchProblem, score_candidates
 from ident.discovery.gates import Gates, impossible, shifts_by, whitened_columns, without_effects_of
 from ident.discovery.search import Finding, paired_t
 from ident.effects.effect import PlacedEffect
+from ident.effects.geometry_corrections import GeometryEffect
 from ident.estimators.estimate import Estimate
 
 
@@ -39,6 +43,7 @@ def choice_covariance(
     estimate: Estimate,
     accepted: Sequence[tuple[Finding, Sequence[Finding]]],
     left: Sequence[Finding],
+    open_effects: Sequence[PlacedEffect] = (),
 ) -> FloatArray:
     """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (m + p, m + p).
 
@@ -46,7 +51,8 @@ def choice_covariance(
         search_problem: linearised around the joint fit.
         estimate: the joint fit.
         accepted: each effect that is still in the fit, with the findings of its turn.
-        left: findings of the last turn that are no noise, but did not join.
+        left: findings that are no noise, but did not join; `fold_errors` are beside this fit.
+        open_effects: effects that left the fit, and may be true.
     """
     shifts = [np.zeros((0, len(estimate.covariance)))]
     for finding, others in accepted:
@@ -62,6 +68,8 @@ def choice_covariance(
     for axis in sorted({one.axis for one in left}):
         rivals = [one for one in left if one.axis == axis]
         shifts.append(_by_rivals(search_problem, nothing, errors, rivals, len(estimate.covariance)))
+    size = len(estimate.covariance)
+    shifts += [_by_open_effect(search_problem, errors, placed, size) for placed in open_effects]
     whole = np.concatenate(shifts)
     return whole.T @ whole
 
@@ -79,6 +87,49 @@ def is_small(finding: Finding, gates: Gates) -> bool:
     )
 
 
+def scored_beside(search_problem: SearchProblem, finding: Finding) -> Finding | None:
+    """Score a finding of another turn beside the present fit; None where the fit contains it.
+
+    Args:
+        search_problem: linearised around the fit.
+        finding: of a problem around another fit.
+    """
+    columns = whitened_columns(search_problem, finding.effect, finding.axis)
+    (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+    if trial is None:
+        return None
+    return replace(finding, coefficients=trial.coefficients, fold_errors=trial.held_out.sum(axis=1))
+
+
+def _by_open_effect(
+    search_problem: SearchProblem, fold_errors: FloatArray, placed: PlacedEffect, size: int
+) -> FloatArray:
+    """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size); no row where the fit contains it."""
+    effect = placed.effect
+    if isinstance(effect, GeometryEffect):  # the description no longer has its applied part
+        effect = effect.with_applied([0.0] * len(effect.coefficients))
+    columns = whitened_columns(search_problem, effect, placed.axis)
+    (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+    if trial is None:
+        return np.zeros((0, size))
+    weight = _weights(fold_errors, trial.held_out.sum(axis=1)[None])
+    moved = shifts_by(search_problem.folds, columns @ trial.coefficients, size)
+    return np.sqrt(weight)[:, None] * moved
+
+
+def _weights(chosen: FloatArray, others: FloatArray) -> FloatArray:
+    """Weight w_r of each model beside the chosen one, shape (models,), by ‖e‖² on each fold.
+
+    Args:
+        chosen: of the chosen model, shape (folds,).
+        others: of the other models, shape (models, folds).
+    """
+    gain = chosen - others
+    better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))
+    odds = better / np.maximum(1.0 - better, np.finfo(np.float64).eps)
+    return np.asarray(odds / (1.0 + odds.sum()))
+
+
 def _by_rivals(
     search_problem: SearchProblem, torque: FloatArray, fold_errors: FloatArray, rivals: Sequence[Finding], size: int
 ) -> FloatArray:
@@ -91,11 +142,9 @@ def _by_rivals(
         rivals: the other effects.
         size: m + p.
     """
-    gain = fold_errors - np.stack([one.fold_errors for one in rivals])
-    better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))
-    odds = better / np.maximum(1.0 - better, np.finfo(np.float64).eps)
+    weights = _weights(fold_errors, np.stack([one.fold_errors for one in rivals]))
     shifts = []
-    for rival, weight in zip(rivals, odds / (1.0 + odds.sum()), strict=True):
+    for rival, weight in zip(rivals, weights, strict=True):
         columns = whitened_columns(search_problem, rival.effect, rival.axis)
         (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
         if trial is not None:

@@ -297,9 +297,8 @@ def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0)
 
 
-def with_covariance(evidence: Evidence, covariance: FloatArray) -> Evidence:
-    """Return the same estimate with another covariance of (gains, parameters), its equations kept."""
-    estimate = replace(evidence.estimate, covariance=covariance)
+def with_estimate(evidence: Evidence, estimate: Estimate) -> Evidence:
+    """Return the same rows with another estimate of the same unknowns, its equations kept."""
     changed = replace(evidence, estimate=estimate)
     changed._identification.extend(replace(one, estimate=estimate) for one in evidence._identification)
     return changed

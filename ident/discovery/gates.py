@@ -68,6 +68,35 @@ def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatA
     return ", ".join(found)
 
 
+def possible_values(columns: Sequence[Column], values: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Move the first values into what physics allows, and the others with them, by their covariance, shape (n,).
+
+    It is what the same fit finds, to first order, if the values that are outside are held at their bounds.
+
+    Args:
+        columns: of the first values, with their bounds.
+        values: of a fit, shape (n,).
+        covariance: of all of them, shape (n, n).
+    """
+    count = len(columns)
+    least = np.array([column.least for column in columns])
+    largest = np.array([column.largest for column in columns])
+    held: dict[int, float] = {}
+    moved = values
+    for _ in range(count):  # one that is held can push another one out
+        inside = np.clip(moved[:count], least, largest)
+        outside = np.flatnonzero(inside != moved[:count])
+        if not len(outside):
+            break
+        held |= {int(place): float(inside[place]) for place in outside}
+        places = list(held)
+        wanted = np.array(list(held.values()))
+        precision = np.linalg.pinv(covariance[np.ix_(places, places)], hermitian=True)
+        moved = values + covariance[:, places] @ precision @ (wanted - values[places])
+        moved[places] = wanted
+    return moved
+
+
 def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CONFIDENCE) -> str:
     """Why coefficients, shape (p,), may all be zero by Wald's test; empty where they may not."""
     probability = probability_of_zero(values, covariance)

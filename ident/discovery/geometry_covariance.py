@@ -7,12 +7,13 @@ direction of their covariance, the rows are built and estimated once more with t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.evidence import Evidence, with_covariance
+from ident.discovery.evidence import Evidence, with_estimate
 from ident.equations.observation import observe
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, Identification
@@ -20,7 +21,7 @@ from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.model.geometry import GeometryChange
 from ident.model.geometry_derivatives import model_with_geometry
-from ident.model.model import Model
+from ident.model.model import Column, Model
 
 LEAST_STEP = 1e-4
 """Step [rad or m] of a refit whose difference is taken: far above the tolerance of the gains' iteration, and a tenth of
@@ -30,8 +31,8 @@ what bends gains by one percent."""
 def geometry_covariance(found: Identification, described: Model, finding: GeometryFinding) -> FloatArray:
     """Covariance that the corrected geometry adds to (gains, parameters), shape (m + p, m + p).
 
-    Other explanations of the same misfit are as likely: the largest difference that one of them makes counts as σ of
-    one more direction.
+    Other explanations of the same misfit are as likely: the one that moves the gains by most of their σ counts as σ of
+    one more direction. Where the gains are fixed, it is the one that moves the parameters by most.
 
     Args:
         found: with the corrected geometry and without effects; it has kept its rows.
@@ -56,9 +57,20 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
         shifts.append(moved * (size / step))
     others = [_alternative(found, described, finding, number) - center for number in range(len(finding.alternatives))]
     if others:
-        shifts.append(max(others, key=lambda shift: float(np.linalg.norm(shift[: len(found.estimate.gains)]))))
+        shifts.append(max(others, key=lambda shift: shift_in_sigmas(shift, found.estimate)))
     columns = np.stack(shifts, axis=1)
     return np.asarray(columns @ columns.T)
+
+
+def shift_in_sigmas(shift: FloatArray, estimate: Estimate) -> float:
+    """Size of a shift of (gains, parameters), shape (m + p,), in σ of the gains, or of parameters beside fixed gains.
+
+    A gain of 100 Nm/A that moves by 1 moves less than one of 1 Nm/A that moves by 0.1.
+    """
+    gains = len(estimate.gains)
+    part = slice(gains, None) if estimate.gains_fixed else slice(gains)
+    std = np.sqrt(np.diag(estimate.covariance))[part]
+    return float(np.linalg.norm(np.divide(shift[part], std, out=np.zeros_like(std), where=std > 0.0)))
 
 
 def _alternative(found: Identification, described: Model, finding: GeometryFinding, number: int) -> FloatArray:
@@ -87,19 +99,26 @@ def with_geometry_covariance(found: Identification, covariance: FloatArray) -> I
     return replace(found, estimate=replace(estimate, covariance=estimate.covariance + covariance))
 
 
-def evidence_with_geometry(evidence: Evidence, covariance: FloatArray) -> Evidence:
+def evidence_with_geometry(evidence: Evidence, covariance: FloatArray, unknowns: Sequence[Column]) -> Evidence:
     """Add the uncertainty of the geometry to an estimate with effects, whose own parameters it leaves alone.
+
+    Rows are found by the names of the parameters: where gravity was turned, there are other base parameters. Those that
+    are new have no part in it.
 
     Args:
         evidence: with effects.
         covariance: of (gains, parameters) without effects, as of `geometry_covariance`.
+        unknowns: these parameters, in the order of the covariance.
     """
     estimate = evidence.estimate
     gains = len(estimate.gains)
-    leading = gains + len(evidence.training.base.names)
-    effects = len(estimate.covariance) - len(covariance)
-    every = np.arange(len(estimate.covariance))
-    shared = np.delete(every, np.arange(leading, leading + effects))
+    place_of = {column.name: gains + number for number, column in enumerate(estimate.unknowns)}
+    targets = list(range(gains))
+    sources = list(range(gains))
+    for source, column in enumerate(unknowns, start=gains):
+        if column.name in place_of:
+            targets.append(place_of[column.name])
+            sources.append(source)
     whole = estimate.covariance.copy()
-    whole[np.ix_(shared, shared)] += covariance
-    return with_covariance(evidence, whole)
+    whole[np.ix_(targets, targets)] += covariance[np.ix_(sources, sources)]
+    return with_estimate(evidence, replace(estimate, covariance=whole))

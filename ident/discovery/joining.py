@@ -290,7 +290,7 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
     while True:
         evidence = model.evidence
         judged = [
-            (placed, *_beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
+            (placed, *beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
         ]
         failing = [one for one in judged if one[2] and one[0] not in needed]
         if not failing:
@@ -309,7 +309,7 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
             needed.add(worst)  # the data cannot be fitted without it
 
 
-def _beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
+def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
     estimate = model.evidence.estimate
     reduced = without_effects_of(model.search_problem, estimate, (placed,))

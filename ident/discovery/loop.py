@@ -13,15 +13,16 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.balancer import propose_balancers
 from ident.discovery.candidates import ColumnCache, SearchProblem
-from ident.discovery.choice import choice_covariance, is_small
+from ident.discovery.choice import choice_covariance, is_small, scored_beside
 from ident.discovery.effect_verdict import EffectVerdict
-from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.evidence import Evidence, with_effects, with_estimate
 from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
     impossible,
     in_noise,
     own_unknowns,
+    possible_values,
     probability_of_zero,
     values_of,
     whitened_columns,
@@ -31,6 +32,7 @@ from ident.discovery.joining import (
     JointFit,
     SetAside,
     as_joined,
+    beside_others,
     join,
     keys_of,
     linearised,
@@ -77,6 +79,9 @@ class Step:
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
     verdicts: tuple[EffectVerdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
+    #: Effects that left although nothing refutes them, and so may be true: σ contains what they would move. Last turn
+    #: only.
+    left_open: tuple[PlacedEffect, ...] = ()
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
@@ -152,30 +157,53 @@ def find_effects(
         seen.add(keys_of(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
-    return (*steps[:-1], end_search(steps, model, gates))
+    return (*steps[:-1], end_search(steps, model, gates, rng=rng))
 
 
-def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
-    """Return the last step with the σ that is reported, and without the effects that this σ does not show.
+def end_search(
+    steps: Sequence[Step],
+    model: JointFit,
+    gates: Gates,
+    *,
+    rng: np.random.Generator,
+    left_open: Sequence[PlacedEffect] = (),
+) -> Step:
+    """Return the last step with the σ that is reported, and with those effects alone that pass in this model.
 
     σ from the choice of the effects comes last, so that an effect can have passed every gate by a smaller one: it
-    leaves where its coefficients may all be zero by the covariance that is reported, or one of them is impossible. The
-    worst leaves first, and the rest is fitted again.
+    leaves where its coefficients may all be zero by the covariance that is reported, or one of them is impossible. An
+    effect that has passed beside another one must pass without it, too: after each that leaves, the rest is fitted
+    again, and passes the gates of a joint fit again; instruments alone are not asked again, because they take as long
+    as a fit. The worst leaves first. An effect that leaves here is not refuted by it, so that σ contains what it would
+    move.
+
+    Of what stays, a coefficient that is a little outside its possible values is held at the nearest one.
 
     Args:
         steps: of the search; the last one is returned.
         model: what it ended with.
         gates: limits of the search.
+        rng: of the bootstrap.
+        left_open: effects that have left already, and may be true.
     """
     aside: list[SetAside] = []
     needed: set[PlacedEffect] = set()
+    opened = list(left_open)
     while True:
-        last = _with_choice(steps, model, gates)
-        last = replace(last, set_aside=(*last.set_aside, *aside))
+        last = _with_choice(steps, model, gates, opened)
         failing = _unshown(last.after)
+        by_what = "by the σ that is reported"
+        if not failing and model.evidence.effects != steps[-1].after.effects:
+            failing = _failing_again(model, rng, gates)
+            by_what = "without what has left"
         failing = [one for one in failing if one[0] not in needed]
         if not failing:
-            return last
+            return replace(
+                last,
+                after=with_possible_values(last.after),
+                set_aside=(*last.set_aside, *aside),
+                left_open=tuple(opened),
+            )
         worst, why, _ = max(failing, key=lambda one: one[2])
         evidence = model.evidence
         kept = tuple(placed for placed in evidence.effects if placed != worst)
@@ -185,9 +213,10 @@ def end_search(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         except UNFITTED:
             needed.add(worst)  # the data cannot be fitted without it
             continue
+        opened.append(worst)
         found = _finding_of(steps, worst)
         if found is not None:
-            aside.append(SetAside(found, f"by the σ that is reported, {why}"))
+            aside.append(SetAside(found, f"{by_what}, {why}"))
 
 
 def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
@@ -202,16 +231,52 @@ def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
         place = len(estimate.gains) + own
         values = values_of(estimate, own)
         covariance = estimate.covariance[np.ix_(place, place)]
-        wrong = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
         std = estimate.parameters_std[own]
-        noise = in_noise(values, covariance)
-        if not noise and not is_unnamed(placed.effect) and np.all(np.abs(values) < std):
+        wrong = impossible(placed.effect.coefficients, values, std)
+        # What is not possible shows nothing: a part below zero must not carry the other one.
+        shown = possible_values(placed.effect.coefficients, values, covariance)
+        noise = in_noise(shown, covariance)
+        if not noise and not is_unnamed(placed.effect) and np.all(np.abs(shown) < std):
             noise = "each of its coefficients is less than its σ: what they are together is not known"
         if wrong:
             failing.append((placed, wrong, 1.0))
         elif noise:
-            failing.append((placed, noise, probability_of_zero(values, covariance)))
+            failing.append((placed, noise, probability_of_zero(shown, covariance)))
     return failing
+
+
+def _failing_again(model: JointFit, rng: np.random.Generator, gates: Gates) -> list[tuple[PlacedEffect, str, float]]:
+    """Effects that do not pass the gates of a joint fit, why, and how much worse left-out moves are with each."""
+    evidence = model.evidence
+    failing: list[tuple[PlacedEffect, str, float]] = []
+    for placed in evidence.effects[evidence.declared :]:
+        fall, why = beside_others(model, placed, rng, gates)
+        if why:
+            failing.append((placed, why, -fall))
+    return failing
+
+
+def with_possible_values(evidence: Evidence) -> Evidence:
+    """Hold coefficients of the effects that are not declared at the nearest possible value.
+
+    They were outside by less than their noise. Everything else moves with them, to first order; σ stays what it is.
+    """
+    estimate = evidence.estimate
+    own = own_unknowns(estimate, evidence.effects[evidence.declared :])
+    if not len(own):
+        return evidence
+    count = len(estimate.gains)
+    order = np.concatenate((count + own, np.setdiff1d(np.arange(len(estimate.covariance)), count + own)))
+    values = np.concatenate((estimate.gains, estimate.parameters))
+    about = np.array([column.about for column in estimate.unknowns])
+    values[count:] += about
+    columns = [estimate.unknowns[index] for index in own]
+    moved = possible_values(columns, values[order], estimate.covariance[np.ix_(order, order)])
+    if np.array_equal(moved, values[order]):
+        return evidence
+    values[order] = moved
+    held = replace(estimate, gains=values[:count], parameters=values[count:] - about)
+    return with_estimate(evidence, held)
 
 
 def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
@@ -223,20 +288,16 @@ def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
     return None
 
 
-def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
+def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates, left_open: Sequence[PlacedEffect]) -> Step:
     """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
     for step in steps:  # an effect that left and joined again counts by its last turn
         found = step.accepted
         if found is not None and (placed := PlacedEffect(found.effect, found.axis)) in model.evidence.effects:
             accepted[placed] = found, (*step.findings, *step.structures)
-    last, left = steps[-1], list[Finding]()
-    is_model_of_search = model.evidence.effects == steps[-1].after.effects
-    if last.accepted is None and is_model_of_search:  # its findings are of this model
-        # A name that structure refutes is no model that could be true.
-        left += [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
-        left += [found for found in (*last.findings, *last.structures) if is_small(found, gates)]
-    choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left)
+    last = steps[-1]
+    left = _small_findings(last, model, gates)
+    choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left, left_open)
     # The coefficient of an effect is that of a model with the effect: another model has none, not another one.
     own = len(estimate.gains) + own_unknowns(estimate, model.evidence.effects)
     choice[own, :] = 0.0
@@ -247,6 +308,22 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates) -> Step:
         return last
     chosen = replace(estimate, covariance=estimate.covariance + choice)
     return replace(last, after=replace(model.evidence, estimate=chosen))
+
+
+def _small_findings(last: Step, model: JointFit, gates: Gates) -> tuple[Finding, ...]:
+    """Findings of the last turn that did not join, and may be true, scored beside a model.
+
+    A model without some of the effects of the last turn is not the one that its findings were scored beside.
+    """
+    if last.accepted is not None:  # its findings are of the model before it
+        return ()
+    # A name that structure refutes is no model that could be true.
+    found = [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
+    found += [finding for finding in (*last.findings, *last.structures) if is_small(finding, gates)]
+    if model.evidence.effects == last.after.effects:
+        return tuple(found)
+    scored = [scored_beside(model.search_problem, finding) for finding in found]
+    return tuple(finding for finding in scored if finding is not None)
 
 
 def _turn(

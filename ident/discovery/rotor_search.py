@@ -15,7 +15,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
-from ident.discovery.gates import Gates
+from ident.discovery.gates import Gates, impossible
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.rotor import next_inertia
 from ident.equations.observation import Observation
@@ -139,6 +139,9 @@ def refined_rotor(
 ) -> Effect:
     """Return a loss with the rotor's inertia that its fit calls for, or the same effect where that is close enough.
 
+    Where the fit calls for a rotor whose inertia is certainly negative, the data show none: the loss then multiplies
+    the load with the rotor in it.
+
     Args:
         search_problem: around the fit.
         effect: the loss, with the inertia as a setting.
@@ -147,6 +150,8 @@ def refined_rotor(
         deviations: their σ, shape (2,).
     """
     before_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
+    if impossible(effect.coefficients[1:], coefficients[1:], deviations[1:]):
+        return effect.with_settings({"with_rotor": 0})
     largest_kg_m2 = largest_inertia(search_problem, axis)
     inertia_kg_m2 = next_inertia(before_kg_m2, coefficients, largest_kg_m2)
     if abs(inertia_kg_m2 - before_kg_m2) * abs(coefficients[0]) <= CLOSE_ENOUGH * deviations[1]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
-from ident.effects.rotor import loss_columns
+from ident.effects.rotor import least_rotor_rest, loss_columns
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -102,11 +102,14 @@ class LoadFriction(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """C, and d with the rotor; units depend on the exponent."""
+        least = least_rotor_rest(self.rotor_inertia_kg_m2)
         if self.speed_exponent:
-            columns = (Column("coefficient", "(rad/s)^-1", least=0.0), Column("rotor rest", "kg m²/(rad/s)"))
+            loss = Column("coefficient", "(rad/s)^-1", least=0.0)
+            rest = Column("rotor rest", "kg m²/(rad/s)", least=least)
         else:
-            columns = (Column("coefficient", "Nm/Nm", least=0.0), Column("rotor rest", "kg m²"))
-        return columns[: 1 + self.with_rotor]
+            loss = Column("coefficient", "Nm/Nm", least=0.0)
+            rest = Column("rotor rest", "kg m²", least=least)
+        return (loss, rest)[: 1 + self.with_rotor]
 
     @property
     def forms(self) -> tuple[LoadFriction, ...]:

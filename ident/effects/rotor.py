@@ -18,6 +18,7 @@ contains what the data leave open about the rotor. J + d/c is the next guess; at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -50,6 +51,15 @@ def loss_columns(
         return np.asarray(loss[None])
     remainder = -acceleration_rad_s2 * np.sign(through_nm) * rubbing
     return np.stack((loss, remainder))
+
+
+def least_rotor_rest(inertia_kg_m2: float) -> float:
+    """Return the least d that is possible beside a guess J of a rotor's inertia [kg m²].
+
+    A rotor's inertia J + d/c is not negative. Beside J = 0 that is d ≥ 0; beside any other J, d is zero within its σ,
+    because J follows it.
+    """
+    return 0.0 if inertia_kg_m2 == 0.0 else -math.inf
 
 
 def next_inertia(inertia_kg_m2: float, coefficients: FloatArray, largest_kg_m2: float) -> float:

@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Switch
-from ident.effects.rotor import loss_columns
+from ident.effects.rotor import least_rotor_rest, loss_columns
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -211,7 +211,8 @@ class Efficiency(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """C, and d with the rotor."""
-        columns = (Column("loss", "Nm/Nm", least=0.0), Column("rotor rest", "kg m²"))
+        rest = Column("rotor rest", "kg m²", least=least_rotor_rest(self.rotor_inertia_kg_m2))
+        columns = (Column("loss", "Nm/Nm", least=0.0), rest)
         return columns[: 1 + self.with_rotor]
 
     @property

@@ -19,7 +19,7 @@ WRITERS = {
     "record_write": ("daq.ledger.ledger", {TARGET}),
     # Calibrations: those that are written, and those that a job proposes or a person enters.
     "enter_calibration": ("daq.ledger.ledger", {TARGET, "daq/cli/history.py", "daq/jobs/stages.py"}),
-    # Steps of a job, which write to no controller.
+    # Steps of a job, which write to no controller. The verdict of new moves goes through `audit_entry` of the report.
     "record_session": ("daq.ledger.ledger", {"daq/jobs/decision.py", "daq/jobs/reporting.py"}),
     "acknowledge": ("daq.ledger.ledger", {"daq/cli/history.py"}),
     "migrate": ("daq.ledger.ledger", {"daq/cli/history.py"}),

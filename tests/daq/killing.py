@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import warnings
 from collections.abc import Callable
 
 import pytest
@@ -17,6 +18,21 @@ _FAILED, _NOT_PERMITTED = 70, 77
 _ptrace = ctypes.CDLL(None, use_errno=True).ptrace
 _ptrace.argtypes = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p)
 _ptrace.restype = ctypes.c_long
+
+
+def in_a_child(work: Callable[[], int]) -> int:
+    """Do some work in a process of its own, which ends with the code that it returns; return its process id."""
+    with warnings.catch_warnings():
+        # Of threads of the test runner, which the child never meets.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        code = _FAILED
+        try:
+            code = work()
+        finally:
+            os._exit(code)
+    return child
 
 
 def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> bool:

@@ -68,7 +68,7 @@ def test_the_certificate_says_that_the_gains_are_written(demonstration: Path) ->
     assert "What was written into out/controller.yaml" in page
     assert "Ready to be written" not in page
     assert "would be written" not in page
-    # 32.96 was in the controller before.
+    # 32.96 was the previous gain.
     assert ">32.96<" in page
 
 

@@ -1,7 +1,7 @@
 """Carry the finished units of a study from one machine to another, with the fingerprints of what they depend on.
 
-    python -m tests.studies.kept_rows pack out/effects-study docs/evidence/data/kept/effects-study.jsonl
-    python -m tests.studies.kept_rows unpack docs/evidence/data/kept/effects-study.jsonl out/effects-study
+    python -m tests.studies.kept_rows pack out/effects-study FILE
+    python -m tests.studies.kept_rows unpack FILE out/effects-study
 
 A study of several hours is done in pieces, on machines that forget. What is packed are its small results alone, rows in
 JSON or CSV, one line of the file for each; recordings and plans are made again. A study that finds a row with another

@@ -93,7 +93,7 @@ def paper_table(number: int) -> PaperTable:
     if number in _PARAMETERS:
         return PaperTable(title, ("", "10 CAD", "mass alone"), _PARAMETERS[number])
     if number in _GAINS:
-        headings = ("axis", "a priori", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e")
+        headings = ("axis", "nameplate", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e")
         return PaperTable(title, headings, _GAINS[number])
     if number == 5:
         return PaperTable(title, ("", *_ERRORS), (("cond(W)", "2177", "2817", "1930"),))

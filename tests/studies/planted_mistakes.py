@@ -83,7 +83,7 @@ class NamedMistake:
     Attributes:
         named: whether it did, on the right axis.
         value, std: of the coefficient in SI, its length where there are several; NaN where it was not named.
-        z: distance of the size found from the planted one in σ; the sense of a coefficient is a matter of convention.
+        z: distance of the value found from that which corrects what was planted, in σ; of a turn, by its size.
         others: all other effects that joined, but those that the cell declares.
     """
 
@@ -180,7 +180,12 @@ def judge_mistake(evidence: Evidence, planted: Planted) -> NamedMistake:
     if not own:
         return NamedMistake(False, float("nan"), float("nan"), float("nan"), others)
     value, std = value_of(evidence, own[0])
-    return NamedMistake(True, value, std, (abs(value) - planted.size) / std, others)
+    return NamedMistake(True, value, std, (value - correcting_value(planted)) / std, others)
+
+
+def correcting_value(planted: Planted) -> float:
+    """Coefficient that corrects a mistake: what has to be added to a position, or by how much a signal is late."""
+    return -planted.size if planted.mistake is Mistake.ZERO else planted.size
 
 
 def predicted_offset_std(evidence: Evidence) -> FloatArray:

@@ -1,6 +1,6 @@
 """The tables of docs/evidence/robots.md, from the rows of the robot study (any_robot.py).
 
-Form of the paper's Tables 4, 7 and 8: gains of the first seed beside their a priori values, and the masses of the
+Form of the paper's Tables 4, 7 and 8: gains of the first seed beside the nameplate, and the masses of the
 payload that the fit was given (in a run of its own) and of a second one.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 from daq.files import replace_file
 
 SUMMARY = ("robot", "gains", "relative error", "gain error mean", "worst", "second payload mean", "worst", "coverage")
-GAINS = ("robot", "axis", "unit", "a priori", "identified", "%σ", "%e from a priori", "%e from the truth")
+GAINS = ("robot", "axis", "unit", "nameplate", "identified", "%σ", "%e from the nameplate", "%e from the truth")
 PAYLOADS = ("robot", "first payload [kg]", "identified", "%σ", "%e", "second payload [kg]", "identified", "%σ", "%e")
 
 

@@ -24,6 +24,7 @@ from ident.discovery.evidence import Evidence
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Lag
+from ident.effects.geometry_corrections import ZeroOffset
 from ident.effects.position import Spring
 from tests.conftest import CHECKOUT
 from tests.studies.any_robot import ROBOTS, StudiedRobot, figures, pooled
@@ -419,3 +420,14 @@ def test_a_mistake_is_named_on_its_own_axis_only_and_its_size_is_judged_in_sigma
     assert not elsewhere.named
     assert elsewhere.others == (spring, lag)
     assert not judge_mistake(evidence, Planted(Mistake.CLEAN)).named
+
+
+@pytest.mark.parametrize("planted_rad", [0.035, -0.035])
+def test_a_zero_that_is_corrected_the_wrong_way_is_far_off(planted_rad: float) -> None:
+    """Positions that are too large by so much need it taken off."""
+    zero = PlacedEffect(ZeroOffset(), 1)
+    planted = Planted(Mistake.ZERO, 1, planted_rad)
+    right = judge_mistake(_evidence_of((zero,), [-planted_rad], [0.001]), planted)
+    wrong = judge_mistake(_evidence_of((zero,), [planted_rad], [0.001]), planted)
+    assert right.z == pytest.approx(0.0)
+    assert abs(wrong.z) == pytest.approx(70.0)

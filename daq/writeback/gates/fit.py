@@ -142,7 +142,7 @@ def error(context: GateContext) -> Iterator[GateFinding]:
 
 
 def holdout(context: GateContext) -> Iterator[GateFinding]:
-    """Require a held-out error no worse than with the nameplate's gains, in total and on each axis."""
+    """Require a held-out error no worse than with the nameplate, in total and on each axis."""
     calibration = context.calibration
     if not _errors_are_finite(calibration):
         return
@@ -161,7 +161,7 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
         yield (
             "calibration",
             "a hold-out that was not compared with the nameplate",
-            "the error of the nameplate's gains on it",
+            "the error with the nameplate on the same run",
             "fit the logs again with free gains and --holdout",
         )
         return
@@ -169,8 +169,8 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
         yield (
             "calibration",
             f"{held.total:.2f} % of the torques of the held-out run",
-            f"less than the {nameplate.total:.2f} % that the nameplate's gains leave of it",
-            "the controller is better off without this calibration: was the payload as declared in every run?",
+            f"less than the {nameplate.total:.2f} % that the nameplate leaves",
+            "the nameplate is better than this calibration: was the payload as declared in every run?",
         )
     names = context.axis_names
     missing = (math.nan,) * (len(names) - len(nameplate.axes))
@@ -180,8 +180,8 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
             yield (
                 name,
                 f"{left:.2f} % of this axis's torque in the held-out run",
-                f"less than the {before:.2f} % that the nameplate's gains leave of it",
-                "the axis is better off without this gain: did its drive, or the scale of its current, change between "
+                f"less than the {before:.2f} % that the nameplate leaves",
+                "the nameplate is better than this gain: did the drive, or the scale of its current, change between "
                 "the runs?",
             )
 

@@ -1,4 +1,4 @@
-"""Gates of the target: each gain beside the one in the controller, the content to be replaced, and who approved it."""
+"""Gates of the target: each gain beside the current gain, the content to be replaced, and who approved it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from daq.config.cell import CellAxis
 from daq.errors import SignatureInvalid, counted
 from daq.writeback.gates.gate import GateContext
-from daq.writeback.request import GainChange, GateFinding, parse_base, short_digest
+from daq.writeback.request import GainChange, GainOrigin, GateFinding, parse_base, short_digest
 from daq.writeback.signature import signers_of
 from ident.calibration import Gain
 from ident.plausible import format_at_limit
@@ -19,10 +19,10 @@ _CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the 
 
 
 def finite_gains(context: GateContext) -> Iterator[GateFinding]:
-    """Require finite numbers: gain (not zero), σ (not negative), number in the controller, nameplate."""
+    """Require finite numbers: gain (not zero), σ (not negative), current gain, nameplate."""
     for change in context.edit.changes:
         if not _is_finite(change):
-            found = f"gain {change.new:g} ± {change.std:g}, {change.old:g} now, nameplate {change.nameplate:g}"
+            found = f"gain {change.new:g} ± {change.std:g}, {_others_text(change)}"
             yield change.axis, found, "finite numbers, not zero", "fit the logs again"
 
 
@@ -47,34 +47,34 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
 
 
 def same_sign(context: GateContext) -> Iterator[GateFinding]:
-    """Require the sign of the gain in the controller and of the nameplate."""
+    """Require the sign of the current gain and of the nameplate."""
     for change in _finite_changes(context):
         if not _keeps_sign(change):
             yield (
                 change.axis,
-                f"gain {change.new:g}, {change.old:g} now, nameplate {change.nameplate:g}",
+                f"gain {change.new:g}, {_others_text(change)}",
                 "the same sign",
                 "check the directions of encoder and current in the cell configuration",
             )
 
 
 def change_bound(context: GateContext) -> Iterator[GateFinding]:
-    """Bound the change from the number in the controller."""
+    """Bound the change from the current gain."""
     policy = context.policy
     for change in filter(_keeps_sign, _finite_changes(context)):
         if not abs(change.change_percent) <= policy.max_change_percent:
             percent = format_at_limit(change.change_percent, policy.max_change_percent, 1, "+f")
-            found = f"a change of {percent} % from the gain now"
+            found = f"{percent} % from the current gain"
             yield change.axis, found, f"at most ±{policy.max_change_percent:g} %", _CURRENT_SCALE
         bound = policy.max_change.get(change.axis)
-        if bound is not None and not abs(change.new - change.old) <= bound:
-            difference = format_at_limit(change.new - change.old, bound, 4, "+g")
-            found = f"a change of {difference} {change.unit} from the gain now"
+        difference = change.new - change.compared_gain
+        if bound is not None and not abs(difference) <= bound:
+            found = f"{format_at_limit(difference, bound, 4, '+g')} {change.unit} from the current gain"
             yield change.axis, found, f"at most ±{bound:g} {change.unit}", _CURRENT_SCALE
 
 
 def nameplate_bound(context: GateContext) -> Iterator[GateFinding]:
-    """Bound the distance from the nameplate."""
+    """Bound the change from the nameplate."""
     bound = context.policy.max_nameplate_percent
     for change in filter(_keeps_sign, _finite_changes(context)):
         if not abs(change.nameplate_percent) <= bound:
@@ -82,7 +82,7 @@ def nameplate_bound(context: GateContext) -> Iterator[GateFinding]:
                 change.axis,
                 f"{format_at_limit(change.nameplate_percent, bound, 1, '+f')} % from the nameplate",
                 f"at most ±{bound:g} %",
-                "check the drive profile, the nameplate gain and the payload's mass",
+                "check the drive profile, the nameplate and the payload's mass",
             )
 
 
@@ -108,7 +108,7 @@ def unit(context: GateContext) -> Iterator[GateFinding]:
 
 
 def _is_finite(change: GainChange) -> bool:
-    numbers = (change.new, change.std, change.old, change.nameplate)
+    numbers = (change.new, change.std, change.compared_gain, change.nameplate_gain)
     return all(map(math.isfinite, numbers)) and change.new != 0 and change.std >= 0
 
 
@@ -117,7 +117,15 @@ def _finite_changes(context: GateContext) -> Iterator[GainChange]:
 
 
 def _keeps_sign(change: GainChange) -> bool:
-    return change.new * change.old > 0 and change.new * change.nameplate > 0
+    return change.new * change.compared_gain > 0 and change.new * change.nameplate_gain > 0
+
+
+def _others_text(change: GainChange) -> str:
+    """Return the current gain, where the controller was read, and the nameplate, each with its word."""
+    nameplate = f"nameplate {change.nameplate_gain:g}"
+    if change.compared_with is GainOrigin.NAMEPLATE:
+        return nameplate
+    return f"{change.compared_with.value} {change.compared_gain:g}, {nameplate}"
 
 
 def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, CellAxis]]:

@@ -244,10 +244,10 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
-    assert "Not in an audit" in capsys.readouterr().out
+    assert "No audit log has this rollback" in capsys.readouterr().out
     audit = tmp_path / "elsewhere.jsonl"
     assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
-    assert "Not in an audit" not in capsys.readouterr().out
+    assert "No audit log has this rollback" not in capsys.readouterr().out
     assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert main(["rollback"]) == ExitCode.USAGE
 
@@ -371,8 +371,8 @@ def test_a_history_that_is_none_does_not_make_a_write_undone(
     assert b"-9.2100" in bench.controller.read_bytes()
 
 
-def _change(axis: str, old: float, new: float, std: float) -> GainChange:
-    return GainChange(axis, axis, 1, old, new, std, "Nm/A", old, "")
+def _change(axis: str, current_gain: float, new: float, std: float) -> GainChange:
+    return GainChange(axis, axis, 1, current_gain, new, std, "Nm/A", current_gain, "")
 
 
 def significant(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> set[str]:
@@ -388,7 +388,7 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     broken = _change("J3", 30.0, float("nan"), 0.1)
     assert significant((large, small, broken)) == {"J2"}
     assert significant((broken,)) == set()
-    # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
+    # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the current gain is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
     assert significant((middle,), Spread({"J4": 0.07})) == set()

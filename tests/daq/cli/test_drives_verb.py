@@ -46,7 +46,7 @@ def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
 def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
     apply_in_drives(cell)
     shown = capsys.readouterr().out
-    assert "in the drive" in shown
+    assert "current gain" in shown
     assert "J4, 2003h:01: -11520 -> -9210" in shown
     assert "Dry run, nothing was written." in shown
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
@@ -159,7 +159,7 @@ def test_an_interrupt_puts_back_what_was_written(
     with pytest.raises(typer.Exit) as caught:
         apply_in_drives(cell, yes=True)
     assert caught.value.exit_code == 130
-    assert "interrupted: kept: the old values are restored in J1, J2, J3" in capsys.readouterr().err
+    assert "interrupted: kept: the previous values are restored in J1, J2, J3" in capsys.readouterr().err
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
 
 

@@ -271,7 +271,7 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
 def test_a_mistyped_nameplate_is_reported_with_its_line(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """25.65 of J3 is written as mNm: the motor's data in the drive and the controller's file contradict it.
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the current gain contradict it.
 
     The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a warning.
     """
@@ -292,10 +292,12 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
         (configs / "controllers/demo.yaml").unlink()
         assert main(["scan", str(file), "--json"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
-    assert f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while it is 25.65 by" in shown.out
+    assert (
+        f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while the current gain is 25.65 ("
+    ) in shown.out
     assert "Next" not in shown.err
     (by_drive,) = document["mistyped"]
-    assert "by N·Kt of the drive's motor" in by_drive
+    assert "while N·Kt of the drive's motor is 25.65 (" in by_drive
     (warning,) = (text for text in document["warnings"] if text.startswith("J1: "))
     assert "near √2" in warning
     assert warning.split()[-1] in shown.out

@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from daq.config.cell_file import load_cell
-from daq.config.document_kind import FORMATS, KEYS, DocumentKind, kind_of_head, kind_of_tree
 from daq.config.drive import drive_from_text
 from daq.config.import_description import load_import
-from daq.config.yaml_file import kind_of_file, parse_yaml
+from daq.config.yaml_file import FORMATS, KEYS, DocumentKind, kind_of_file, kind_of_head, kind_of_tree, parse_yaml
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import DaqError
 from daq.log.reader import read_log

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,19 @@ import pytest
 from playwright.sync_api import Browser, FloatRect, Page, Request, sync_playwright
 
 from daq.cli.app import main
+from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import save_calibration
+from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress, RecordedRun
 from daq.errors import ExitCode
+from daq.jobs.position import sessions_folder
+from daq.jobs.session import Session, save
 from daq.log.conversion import scaling
+from daq.log.feed import Feed, QuickGain, QuickLook
 from daq.log.reader import Log, read_log
 from daq.log.salvage import salvage
 from drivers.messages import EventKind
-from tests.daq.console.feeds import predicting_calibration
+from tests.daq.console.feeds import TOKEN, Recording, predicting_calibration, served
 
 CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")
 pytestmark = [
@@ -339,3 +345,63 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
             })"""
         )
         assert lines and set(lines) == {1}
+
+
+def _state_after_three_blocks(cell: Cell, folder: Path) -> None:
+    """A session of `calibrate` that waits for its fourth block."""
+    roles = ("bare", "loaded", "held-out", "loaded")
+    blocks = tuple(
+        Block(
+            name=f"block-{number}-{role}",
+            payload=None if role == "bare" else "disc",
+            mass_kg=None if role == "bare" else 4.59,
+            holdout=role == "held-out",
+            plan=f"plan-{number}.yaml",
+        )
+        for number, role in enumerate(roles, 1)
+    )
+    runs = tuple(
+        RecordedRun(name=block.name, sha256="", attempts=1, samples=1, lost_cycles=0, missing=()) for block in blocks
+    )
+    gains = tuple(
+        GainSoFar(axis=axis.name, unit=axis.gain_unit, value=10.0, std_percent=0.9, target_percent=0.5)
+        for axis in cell.axes
+    )
+    progress = Progress(blocks=3, motion_s=60.0, fitted_s=40.0, std_percent=(0.9,) * len(gains))
+    state = GuidedState(
+        session=folder.name,
+        cell=cell.name,
+        configuration_sha256="",
+        began="2026-01-05T02:00:00+00:00",
+        attempt_began="2026-01-05T02:00:00+00:00",
+        blocks=blocks,
+        runs=runs[:3],
+        gains=gains,
+        judged_blocks=3,
+        progress=(progress,),
+    )
+    folder.mkdir(parents=True)
+    save(Session(folder, state))
+
+
+def test_the_session_shows_the_gains_after_each_move(browser: Browser, cell: Cell, cell_file: Path) -> None:
+    folder = sessions_folder(cell_file) / "20260105T020000Z"
+    _state_after_three_blocks(cell, folder)
+    gains = [QuickGain(axis.name, axis.gain_unit, 10.0, 0.8, 0.5) for axis in cell.axes]
+    look = QuickLook("block-4-loaded", 1, 9, 44.0, gains=gains, why="it needs more moves", left_s=69.0)
+    with served(cell_file, cell) as console, Feed(cell_file) as feed, browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"http://127.0.0.1:{console.port}/{TOKEN}/")
+        until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
+        recording = Recording(feed, cell, folder / "block-4-loaded.mcap")
+        for number in (1, 2):
+            feed.look(replace(look, move=number, motion_s=40.0 + 4.0 * number))
+            recording.run(50)
+            until(page, f"document.getElementById('outlook').textContent.includes('after move {number} of 9')")
+        assert page.inner_text("#next-step") == "The robot moves: block-4-loaded"
+        assert "J1 is worst (it needs more moves): about 69 s left" in page.inner_text("#outlook")
+        # One point of the block that was judged and two of moves since, for each axis.
+        assert page.locator("#precision circle").count() == 3 * len(cell.axes)
+        assert page.locator("#precision circle.quick").count() == 2 * len(cell.axes)
+        feed.finish()
+        until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")

@@ -19,7 +19,18 @@ from daq.config.cell import Cell, PacingMode
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import Page
-from daq.log.feed import HEAD, SAMPLES, TEXT, Feed, FeedUnfit, facts_of_recorder, packet_struct, socket_names
+from daq.log.feed import (
+    HEAD,
+    SAMPLES,
+    TEXT,
+    Feed,
+    FeedUnfit,
+    QuickGain,
+    QuickLook,
+    facts_of_recorder,
+    packet_struct,
+    socket_names,
+)
 from tests.daq.console.feeds import TOKEN, Recording, arrivals, facts, served
 
 EVENT = {"time_ns": 0, "axis": 2, "kind": "emcy", "code": 0x7305, "text": "EMCY 7305h"}
@@ -69,6 +80,17 @@ def test_keys_of_a_later_version_are_ignored(cell: Cell, cell_file: Path) -> Non
     live.take(_text({**_run(cell, of_tomorrow=1), "of_tomorrow": 2}))
     live.take(_samples(len(cell.axes), 1))
     assert (live.phase, live.samples) == ("running", 1)
+
+
+def test_a_look_at_the_gains_is_shown_until_the_next_run(cell: Cell, cell_file: Path) -> None:
+    look = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)], left_s=12.0)
+    live = Live(cell_file, cell)
+    live.take(_text(_run(cell)))
+    assert live.status()["quick"] is None
+    live.take(_text({"quick": asdict(look)}))
+    assert live.status()["quick"] == asdict(look)
+    live.take(_text(_run(cell)))
+    assert live.status()["quick"] is None
 
 
 @contextmanager

@@ -530,7 +530,7 @@ def test_an_integer_keeps_its_style_and_another_unit_its_factor(
     reported = rewrite_gain(scalar, gain, std, factor)
     assert reported.spelling == spelling
     assert abs(reported.new - gain) <= std
-    assert reported.old == scalar.value / factor
+    assert reported.current_gain == scalar.value / factor
     (read,) = document.with_values({key: spelling}).locate((key,))
     assert read.value / factor == reported.new
 

@@ -39,6 +39,9 @@ class MadeSession(Made):
     before: Validation
     after: Validation
 
+    def _plan_of(self, _cell: Cell, *, seed: int, duration_s: float, **_further: Any) -> Plan:
+        return self.plans[seed]
+
     def tools(self, rig: Rig, **factors: float) -> Tools:
         """As for a job, with plans and predictions."""
 
@@ -49,7 +52,7 @@ class MadeSession(Made):
 
         return replace(
             super().tools(rig, **factors),
-            plan=lambda _cell, *, seed, duration_s: self.plans[seed],
+            plan=self._plan_of,
             look=lambda *_: BlockFacts(),
             preview=lambda _cell, _plan, _file, page: page.touch(),
             validate=predicted,
@@ -131,7 +134,7 @@ def whole_session(folder: Path) -> tuple[Rig, MadeSession]:
 
         return called
 
-    def quick_plan(cell: Cell, *, seed: int, duration_s: float) -> Plan:
+    def quick_plan(cell: Cell, *, seed: int, duration_s: float, **_further: Any) -> Plan:
         plans[seed] = plan(
             cell, seed=seed, duration_s=duration_s, exchanges=100, largest_condition=1e6, largest_std_percent=100.0
         )

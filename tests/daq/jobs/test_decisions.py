@@ -29,6 +29,30 @@ NEEDS_PERSON, BY_THE_JOB = (
 """The logs of these tests are as old as the year in which they play."""
 
 
+def test_a_job_that_writes_makes_its_certificate_once_more(tmp_path: Path, made: Made) -> None:
+    """The first one is made before the decision; what stays must not say that the gains are still to be written."""
+    rig = made_rig(tmp_path / "cell", made)
+    tools = rig.tools
+    before: list[str] = []
+
+    def ends_first(*_: object) -> Any:
+        before.append((rig.session.folder / "report" / "report.html").read_text())
+        raise KeyboardInterrupt
+
+    rig.tools = replace(tools, certify=ends_first)
+    with pytest.raises(KeyboardInterrupt):
+        rig.job()
+    assert not rig.session.finished
+    rig.tools = tools
+    rig.clock.go_on(minutes=5)
+    assert rig.job().outcome is Outcome.APPLIED
+    page = (rig.session.folder / "report" / "report.html").read_text()
+    assert "written on 2026-01-05" not in before[0]
+    assert "written on 2026-01-05" in page
+    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
+    assert (rig.session.state.attempt, rig.session.finished) == (2, True)
+
+
 def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_shown(
     tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,7 +50,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     assert history.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
     # By which `history --verify` notices an audit whose end was cut off.
     assert noted_heads(rig.cells / "demo.audit.jsonl") == (rig.audit[-1].sha256,)
-    # The numbers in the file were the manufacturer's: of none of them a σ is known.
+    # The current gains are the nameplates, which have no σ.
     assert session.state.decision is not None
     assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
     assert [gain.alarm for gain in session.state.watched] == [""] * 6

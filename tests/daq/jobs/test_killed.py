@@ -7,7 +7,6 @@ import random
 import shutil
 import signal
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -26,15 +25,16 @@ from daq.writeback.target import rollback
 from tests.daq.histories import history_of, ledger_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
+from tests.daq.killing import in_a_child
 
 pytestmark = pytest.mark.processes
 
-OF_GUIDED_SESSIONS = {"preview", "look", "validate"}  #: Tools that a job does not call
+OF_GUIDED_SESSIONS = {"preview", "look", "validate", "network"}  #: Tools that a job does not call
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"} | OF_GUIDED_SESSIONS)
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 
 
-EFFECTS = ("record", "save_report", "apply")
+EFFECTS = ("record", "save_report", "apply", "certify")
 PURE = ("close_loop", "calibration", "account")
 """Nothing is written between the fit and these: to be killed there is to be killed at the fit."""
 FREQUENT = {"now": 6, "run": 6, "record": 2, "free": 2}
@@ -67,15 +67,7 @@ class Kill:
 
 def killed_job(rig: Rig, kill: Kill) -> None:
     """The job in a process of its own, which does not survive it."""
-    with warnings.catch_warnings():
-        # Of threads of the test runner, which the child never meets.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
-    if child == 0:
-        try:
-            replace(rig, tools=kill.tools(rig.tools)).job()
-        finally:
-            os._exit(0)
+    child = in_a_child(lambda: replace(rig, tools=kill.tools(rig.tools)).job().exit_code)
     _, status = os.waitpid(child, 0)
     assert os.WIFSIGNALED(status)
     assert os.WTERMSIG(status) == signal.SIGKILL
@@ -142,14 +134,7 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
 
 def killed_after(rig: Rig, wait_s: float) -> bool:
     """Run the job in a process of its own, and kill that after so long; return whether it was not done before."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
-    if child == 0:
-        try:
-            rig.job()
-        finally:
-            os._exit(0)
+    child = in_a_child(lambda: rig.job().exit_code)
     time.sleep(wait_s)
     os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,6 +20,7 @@ from daq.documents.session_state import Outcome
 from daq.log.container import UNFINISHED
 from tests.daq.jobs.made import Made
 from tests.daq.jobs.rig import Rig, make_rig
+from tests.daq.killing import in_a_child
 
 pytestmark = pytest.mark.processes
 
@@ -57,14 +57,7 @@ def real_recorder(rig: Rig, made: Made) -> Rig:
 
 def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
     """Run the job in a process of its own, and kill it when the unfinished log of this run has that size."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of threads of the test runner
-        child = os.fork()
-    if child == 0:
-        try:
-            rig.job()
-        finally:
-            os._exit(0)
+    child = in_a_child(lambda: rig.job().exit_code)
     ended = 0
     while not ended:
         parts = [path.stat().st_size for path in rig.cells.glob(f"*/*/{name}.mcap{UNFINISHED}")]

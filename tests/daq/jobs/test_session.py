@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
-from daq.documents.session_state import Outcome, PlannedWrite, SessionState
+from daq.documents.session_state import JobState, Outcome, PlannedWrite
 from daq.errors import ExitCode, JobHeld
 from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
@@ -138,7 +138,7 @@ def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, ti
 @given(st.datetimes(timezones=st.just(UTC)), st.integers(0, 10**9))
 def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s: int) -> None:
     at, reported = BEGAN + timedelta(seconds=later_s), began.isoformat()
-    state = SessionState(session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported)
+    state = JobState(session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported)
     if began > at + CLOCK_SLACK:
         with pytest.raises(JobHeld, match="the clock of this computer"):
             require_clock((Session(Path("s"), state),), at)

@@ -5,23 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from daq.cli.app import main
 from daq.cli.simulate import MountedFile
-from daq.documents.calibration_file import load_calibration
-from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, UsageError
-from daq.jobs.context import Tools
-from daq.jobs.reporting import Conclusion
-from daq.ledger.standing import StandingState
-from daq.report.comparison import Comparison
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import CellSpec
-from tests.daq.calibrations import calibration_for
 from tests.daq.jobs.rig import make_rig, serving
 from tests.drivers.scripted import FakeClock, ScriptedBus
 
@@ -75,36 +67,6 @@ def test_a_cell_without_the_section_names_what_it_lacks(
     for verb in ("recalibrate", "schedule", "install-units"):
         assert main([verb, "--cell", str(cell)]) == ExitCode.CONFIGURATION
         assert "recalibration" in capsys.readouterr().err
-
-
-def test_a_job_that_writes_makes_its_certificate_once_more(
-    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first one is made before the decision; what stays must not say that the gains are still to be written."""
-    rig = make_rig(tmp_path / "cell", short_plan)
-    folder = tmp_path / "20260105T020000Z"
-    pages: list[tuple[Comparison, str | None]] = []
-
-    def save(
-        _fit: object, _account: object, _calibration: object, _folder: Path, compared: Comparison, **more: Any
-    ) -> None:
-        pages.append((compared, more["session"]))
-
-    def job(_file: Path, _cell: object, tools: Tools, _journal: object, **_: object) -> Conclusion:
-        file = calibration_for(rig.cell_file)
-        # The job decides after the first report, and writes.
-        tools.save_report(None, None, load_calibration(file), folder / "report")  # type: ignore[arg-type]
-        assert main(["apply", str(rig.cell_file), str(file), "--yes"]) == ExitCode.OK
-        return Conclusion(Outcome.APPLIED, 0, None, "")
-
-    monkeypatch.setattr("daq.jobs.certificate.save_report", save)
-    monkeypatch.setattr("daq.jobs.job.recalibrate", job)
-    assert main(["recalibrate", str(rig.cell_file)]) == ExitCode.OK
-    states = [compared.standing.state for compared, _ in pages]
-    assert states == [StandingState.NOT_WRITTEN, StandingState.WRITTEN]
-    assert pages[1][0].in_force is not None
-    assert [session for _, session in pages] == [folder.name] * 2
-    assert "Outcome: applied" in capsys.readouterr().out
 
 
 def masses(cell: SimulatedCell) -> float:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, append, read
-from daq.ledger.ledger import Ledger, record_session
-from daq.ledger.standing import Standing, StandingState, read_standing
+from daq.ledger.ledger import Ledger, Standing, StandingState, read_standing, record_session
+from daq.report.history import describe_actions
 from tests.daq.histories import BEGIN, calibration_of, enter, ledger_in, write
 
 NOW = BEGIN + timedelta(days=400)
@@ -29,6 +29,24 @@ def accept(ledger: Ledger, digest: str, cell: str = "demo") -> None:
     details = {"session": "20260105T060000Z", "cell": cell, "calibration_sha256": digest}
     at = BEGIN + timedelta(hours=2)
     record_session(ledger.audit, AuditAction.ACCEPTED, at=at, who="anna", subject="session", details=details)
+
+
+def test_new_moves_that_contradict_a_calibration_are_its_state_until_others_accept_it(ledger: Ledger) -> None:
+    digest = enter(ledger, calibration_of(0))
+    write(ledger, FILE, sha256(b"1"), digest=digest, at=BEGIN + timedelta(hours=1), who="anna")
+    details = {"session": "x", "cell": "demo", "calibration_sha256": digest, "remark": "J4", "undo": "rollback"}
+    at = BEGIN + timedelta(hours=2)
+    record_session(ledger.audit, AuditAction.NOT_ACCEPTED, at=at, who="anna", subject="session", details=details)
+    standing = read_standing(ledger, digest, NOW)
+    assert standing.state is StandingState.NOT_ACCEPTED
+    assert standing.acceptance is not None
+    assert (standing.acceptance.remark, standing.acceptance.undo) == ("J4", "rollback")
+    (entry,) = standing.history.entries
+    assert describe_actions([entry], standing.history.events, digest) == {
+        digest: "applied by anna, NOT ACCEPTED by anna, in force"
+    }
+    accept(ledger, digest)
+    assert state(ledger, digest) is StandingState.ACCEPTED
 
 
 def state(ledger: Ledger, digest: str) -> StandingState:

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from daq.cli import main
 from daq.errors import DataError, ExitCode, LogCorrupt, LogTruncated, TableUnfit
-from daq.log.formats import reader_of
+from daq.log.importing import reader_of
 from daq.log.mcap_bag import unpack_message
 from daq.log.message import JOINTS_SCHEMA
 from tests.daq.log.test_bag import EFFORT, JOINTS, POSITION, ROWS, START_NS, STEP_NS, assert_whole, read

@@ -16,7 +16,7 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import encode_calibration, load_calibration, save_calibration
-from daq.documents.session_state import Fitted, SessionState
+from daq.documents.session_state import Fitted, JobState
 from daq.errors import CalibrationRefused, ExitCode
 from daq.files import sha256
 from daq.jobs.session import Session, save, session_of
@@ -120,8 +120,8 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(0.0459)
     texts = Reader(_page(replace(calibration, payload_mass=(alike,)))).texts
     sheet = next(text for text in texts if text.startswith("disc: 4.59 kg in the cell file"))
-    assert "with a mass of disc that is wrong by 1 %, every gain is wrong by 1 %" in sheet
-    assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not in σ" in sheet
+    assert "if the mass of disc is wrong by 1 %, every gain is wrong by 1 %" in sheet
+    assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not included in σ" in sheet
     assert "Dependence of the gains on the payload's mass" in texts
     assert f"{gains[0].value / 4.59:.4g}" in texts
     # With the drawing known too, each gain has a number.
@@ -130,7 +130,7 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     drawn = replace(calibration, payload_mass=(PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),))
     sheet = next(text for text in Reader(_page(drawn)).texts if text.startswith("disc: 4.59 kg in the cell file"))
     assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
-    assert "which is at most ± 0.6 % of every gain, not in σ" in sheet
+    assert "which is at most ± 0.6 % of every gain, not included in σ" in sheet
     report = json_tree(certificate_report(certify(drawn, without_controller(drawn, "", NOW))))
     (found,) = report["payload_mass"]
     assert (found["payload"], found["mass_kg"], found["tolerance_kg"]) == ("disc", 4.59, 0.0459)
@@ -205,6 +205,17 @@ def test_the_verdict_is_that_of_the_gates() -> None:
     assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
 
 
+def test_without_a_controller_no_message_names_a_current_gain() -> None:
+    calibration = demo_calibration()
+    first = calibration.gains[0]
+    reversed_gain = replace(first, value=-first.value)
+    reversed_first = replace(calibration, gains=(reversed_gain, *calibration.gains[1:]))
+    certificate = certify(reversed_first, without_controller(reversed_first, "", NOW))
+    (sign,) = (one for one in certificate.comparison.refusals if one.gate is Gate.SIGN)
+    assert sign.found == "gain -33.9, nameplate 32.96"
+    assert "current gain" not in certificate_page(certificate)
+
+
 def test_gains_that_were_held_are_the_first_reason() -> None:
     calibration = demo_calibration()
     held = replace(calibration, gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains))
@@ -239,18 +250,20 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
     assert [axis["key"] for axis in document["axes"]] == [f"drives.J{number}.gain" for number in range(1, 7)]
-    # J4 went from -11.52 to -9.21: its size decreased. The number in the controller is no calibration's.
+    # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
     assert document["axes"][3]["change_sigmas"] < 0.0 < document["axes"][0]["change_sigmas"]
     texts = Reader(page.read_text(encoding="utf-8")).texts
-    taken = "the number in the controller taken as exact (all axes)."
-    assert f"More than noise: probability below 1 % among all axes, {taken}" in texts
+    assert (
+        "More than noise: the probability that noise alone makes such a change, on any axis, is below 1 %; the current "
+        "gain is taken as exact on all axes."
+    ) in texts
     # Of gains that must not be written the page does not show what would be.
     assert not {axis["written"] for axis in document["axes"]} & set(texts)
     assert not any("would be written" in text for text in texts)
     assert main(["certificate", str(file), "--json"]) == ExitCode.OK
     unread = json.loads(capsys.readouterr().out)["axes"]
     assert all(axis["key"] is axis["line"] is None for axis in unread)
-    assert "the nameplate taken as exact (all axes)." in page.read_text(encoding="utf-8")
+    assert "the nameplate is taken as exact on all axes." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
     assert main(["certificate", str(file)]) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"
@@ -334,8 +347,8 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(c
     assert status["ended"] is None
     assert document["sentence"].startswith("Written on ")
     assert "by A. Miller" in document["sentence"]
-    assert "most J4 by -20.1 %" in document["sentence"]
-    # In JSON the gains are compared with those that are in the controller now.
+    assert "J4 most, by -20.1 %" in document["sentence"]
+    # In JSON the gains are compared with the current gains.
     assert document["verdict"] == "unchanged"
     assert [axis["old"] for axis in document["axes"]] == pytest.approx(IDENTIFIED, rel=1e-4)
     texts = Reader(certificate_page(certificate)).texts
@@ -394,8 +407,35 @@ def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     record_session(audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
     status = _document(_certificate(cell_file, calibration_file))["status"]
     assert status["state"] == "accepted"
-    assert status["acceptance"] == {"at": NOW.isoformat(), "who": "A. Miller"}
+    assert status["acceptance"] == {
+        "at": NOW.isoformat(),
+        "who": "A. Miller",
+        "accepted": True,
+        "remark": "",
+        "undo": "",
+    }
     assert "; accepted on 2025-01-02 03:00 UTC by A. Miller (as of " in status["text"]
+
+
+def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_undo_it(cell_file: Path) -> None:
+    calibration_file = calibration_for(cell_file)
+    _apply(cell_file, calibration_file)
+    details = {
+        "session": "x",
+        "cell": "demo",
+        "calibration_sha256": sha256(calibration_file.read_bytes()),
+        "remark": "J4 is 25 % off",
+        "undo": "drivegain rollback demo.yaml",
+    }
+    audit = cell_file.with_name("demo.audit.jsonl")
+    record_session(audit, AuditAction.NOT_ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
+    certificate = _certificate(cell_file, calibration_file)
+    status = _document(certificate)["status"]
+    assert status["state"] == "not accepted"
+    assert "; NOT ACCEPTED on 2025-01-02 03:00 UTC by A. Miller: J4 is 25 % off" in status["text"]
+    assert "to undo the write: drivegain rollback demo.yaml" in status["text"]
+    assert certificate.sentence.endswith(". New moves contradict them: J4 is 25 % off.")
+    assert "To undo the write: <code>drivegain rollback demo.yaml</code>" in certificate_page(certificate)
 
 
 def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
@@ -437,7 +477,7 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
     save_calibration(demo_calibration(), file)
     digest = sha256(file.read_bytes())
     at = NOW.isoformat()
-    state = SessionState(
+    state = JobState(
         session=folder.name,
         cell="demo",
         configuration_sha256="c",

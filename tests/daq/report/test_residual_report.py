@@ -37,6 +37,7 @@ from daq.report.plots import draw_fit
 from daq.report.residual import (
     Headline,
     SentenceScreen,
+    _effect_sentence,
     _gear_sentence,
     candidate_rows,
     error_change_text,
@@ -54,7 +55,7 @@ from daq.workflow.fit import Fit, calibration_of, fit
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, RelativeErrors, account
-from ident.discovery.error_change import PairedChange
+from ident.discovery.error_change import ErrorChange, PairedChange
 from ident.discovery.evidence import with_effects
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.joining import SetAside
@@ -335,6 +336,18 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
 
 
+def test_a_correction_of_the_description_is_shown_by_the_error_of_all_axes(closed: Closed) -> None:
+    turn = closed.account.turns[0]
+    assert turn is not None
+    assert turn.before.holdout is not None
+    assert turn.after.holdout is not None
+    sentence = _effect_sentence(
+        closed.fitted, closed.account, turn, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
+    )
+    change = error_change_text(turn.before.holdout.total, turn.after.holdout.total)
+    assert sentence == f"J2 has a zero that is off: the error of all axes on held-out runs {change}."
+
+
 def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed: Closed) -> None:
     """On J2 it is half of σ, on the others a tenth."""
     gains = closed.account.total.gains
@@ -346,6 +359,10 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
     assert sentence in summary(closed.fitted, changed, ())
     assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account, ()))
+    opened = replace(closed.fitted.steps[-1], left_open=(SPRING,))
+    undecided = replace(closed.fitted, steps=(*closed.fitted.steps[:-1], opened))
+    more = f"{sentence} spring on J3 is not in the model and may be true: σ holds what that would move."
+    assert more in summary(undecided, changed, ())
     document = Closed(closed.fitted, changed).document()
     assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
 
@@ -423,7 +440,10 @@ def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed)
         statistical_sentences(closed.fitted, replace(closed.account, skew=skew)) for skew in (None, biased)
     )
     assert any(text.startswith("A time skew between currents and positions is not known") for text in unknown)
-    assert any("0.04 ± 0.06 ms, which may be zero" in text for text in unconfirmed)
+    assert any(
+        text.endswith("is not confirmed: instruments from the demanded motion give 0.04 ± 0.06 ms.")
+        for text in unconfirmed
+    )
 
 
 @dataclass(frozen=True)
@@ -500,7 +520,7 @@ def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, colu
     for gain in calibration.gains:
         assert f"{gain.std_percent:.2f}" in screen.text
         assert f"{gain.change_percent:+.1f}" in screen.text
-    for statistics in ("Turn 1", "would have been detected", "Not added", "failed a check", "may have", "scales all"):
+    for statistics in ("Turn 1", "Detection limit", "Not added", "failed a check", "may have", "scales all"):
         assert statistics not in screen.text
 
 
@@ -540,7 +560,7 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed
         assert one.tolerance_std == pytest.approx(abs(one.per_kg) * 0.0459)
     verbose = residual_view(weighed, closed.account, calibration, verbose=True)
     sentences = [part.text for part in verbose if isinstance(part, Sentence)]
-    assert any("which is ± 1 % of every gain, not in σ" in one for one in sentences)
+    assert any("which is ± 1 % of every gain, not included in σ" in one for one in sentences)
     # The file has it, and one of an earlier version is read without.
     path = tmp_path / "calibration.yaml"
     save_calibration(calibration, path)
@@ -669,8 +689,10 @@ def test_effects_that_held_out_runs_refute_are_not_written(
 ) -> None:
     del shelved
     out, folder = tmp_path / "calibration.yaml", tmp_path / "report"
-    for module in (fit_module, before_after_module):
-        monkeypatch.setattr(module, "holdout_change", lambda *_: PairedChange(5.0, 1.0, 20))
+    rise = PairedChange(5.0, 1.0, 20)
+    monkeypatch.setattr(before_after_module, "holdout_change", lambda *_: rise)
+    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
     for name in ("fit", "close_loop"):
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
     command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), "--report", str(folder)]
@@ -684,8 +706,21 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     assert "because --accept-worse-holdout was given" in capsys.readouterr().out
     assert out.exists()
     assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
-    with pytest.raises(EffectsRefuted, match="20 moves"):
+    with pytest.raises(EffectsRefuted, match="20 independent blocks of moves"):
         fit_module.check_holdout(closed.fitted)
+
+
+def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
+    closed: Closed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rise = PairedChange(5.0, 1.0, 20)
+    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
+    last = closed.fitted.steps[-1]
+    assert last.after.effects
+    fit_module.check_holdout(replace(closed.fitted, steps=(replace(last, declared=True),)))
+    with pytest.raises(EffectsRefuted):
+        fit_module.check_holdout(replace(closed.fitted, steps=(last,)))
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])
@@ -749,9 +784,9 @@ def test_what_rises_is_not_said_to_fall() -> None:
 
 def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
     turned = Parameter("zero-offset offset 3", -math.radians(2.0), math.radians(0.04), "rad")
-    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°"
+    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°, to be added to its position"
     moved = Parameter("zero-offset offset 1", 0.003, 0.0001, "m")
-    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m"
+    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m, to be added to its position"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
@@ -890,8 +925,8 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     one_sided = GearLoss(motoring_rows=0.9, motoring_torque=0.97, loss=0.01, loss_std=0.04)
     both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
     text = next(_gear_sentence("J3", one_sided, in_model=False))
-    assert text.startswith("The gain of J3 carries the efficiency of its gear: the motor drives in 97 %")
-    assert "loss of up to 8.0 % would not show; it would change the gain by 7.5 %" in text
+    assert text.startswith("The gain of J3 includes the efficiency of its gear: the motor drives in 97 %")
+    assert "loss of up to 8.0 % would not show, and would change the gain by 7.5 %" in text
     assert not list(_gear_sentence("J3", both, in_model=False))
     found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
     assert "efficiency of 81.6 %" in next(_gear_sentence("J3", found, in_model=True))

@@ -38,7 +38,7 @@ def _said(verdict: EffectVerdict) -> list[str]:
     ("judgement", "written", "words"),
     [
         (Judgement.UNDECIDED, False, "Undecided, and not written: spring on J2: because; 3.50 %"),
-        (Judgement.UNDECIDED, True, "Undecided, and written as asked: spring on J2"),
+        (Judgement.UNDECIDED, True, "Undecided, and written because of --write-undecided: spring on J2"),
         (Judgement.REFUTED, False, "Held-out runs refute spring on J2: because; 3.50 %"),
         (Judgement.CONFIRMED, False, "Held-out runs confirm spring on J2, but"),
     ],

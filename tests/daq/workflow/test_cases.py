@@ -209,7 +209,7 @@ def test_without_bare_runs_the_calibrations_robot_serves(calibrations: dict[str,
         assert isinstance(mass, Mass)
         assert mass.mass_kg == pytest.approx(4.59, rel=0.01)
     (table, other) = mass_tables(found)
-    assert "on the robot of the calibration" in table.notes[0]
+    assert "the robot is that of the calibration" in table.notes[0]
     assert (other.number, other.title) == (8, "mass of payload plate (b), 4.5 kg")
 
 

@@ -26,7 +26,7 @@ def readings(cell: Cell, factor: float = 1.0) -> list[ScaleReading]:
 
 
 @pytest.mark.parametrize("name", ["demo", "gantry", "seven-axis"])
-def test_name_plates_that_agree_say_nothing_whatever_the_drive_train(name: str, checkout: Path) -> None:
+def test_nameplates_that_agree_say_nothing_whatever_the_drive_train(name: str, checkout: Path) -> None:
     path = checkout / f"configs/cells/{name}.yaml"
     cell = load_cell(path)
     check_nameplates(path, cell, readings(cell))
@@ -67,7 +67,10 @@ def test_a_controller_with_another_gain_is_refused_with_both_lines(checkout: Pat
     text = controller.read_text()
     line = 1 + next(n for n, line in enumerate(text.splitlines()) if "25.65" in line)
     controller.write_text(text.replace("25.65", "25650"))
-    words = f"axes[2].nameplate_gain_nm_per_a: found 25.65 Nm/A, while it is 2.565e+04 by demo.yaml, line {line}"
+    words = (
+        "axes[2].nameplate_gain_nm_per_a: found 25.65 Nm/A, while the current gain is 2.565e+04 "
+        f"(demo.yaml, line {line})"
+    )
     with pytest.raises(ConfigurationInconsistent, match=re.escape(words)):
         check_controller(path, load_cell(path))
     # In another unit by declaration, it is the same gain.

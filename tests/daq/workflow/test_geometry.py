@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from math import radians
 from pathlib import Path
 
@@ -20,18 +20,22 @@ from daq.report.certificate import certificate_report, certify
 from daq.report.comparison import without_controller
 from daq.report.document import json_tree
 from daq.workflow import fit as fitting
-from daq.workflow.fit import Fit, calibration_of, fit, with_corrected_geometry
+from daq.workflow.fit import Fit, calibration_of, close_loop, fit, with_corrected_geometry
 from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather, with_effects
-from ident.discovery.geometry_covariance import evidence_with_geometry
+from ident.discovery.geometry_covariance import evidence_with_geometry, shift_in_sigmas
+from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
 from ident.errors import ModelError
 from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
+from ident.estimators.identify import estimate_with
+from ident.estimators.method import Method
 from ident.model.closed_chain import positions, reach
 from ident.model.geometry import GeometryKind, GeometryParameter, described_length
+from ident.model.model import Column
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import RECORDED
 
@@ -140,7 +144,13 @@ def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
 @pytest.mark.parametrize(
     ("cell", "parameter", "change", "name", "remedy"),
     [
-        (_with_zero(0.5), ZERO, -np.radians(0.5), "zero-off", "add -0.500. deg to `zero_offset_deg` of crank-2"),
+        (
+            _with_zero(0.5),
+            ZERO,
+            -np.radians(0.5),
+            "zero-off",
+            r"add -0\.500\d* to `zero_offset_deg` of crank-2 in the cell file, which makes it -?0\.000\d*",
+        ),
         (_with_rod(0.3), ROD, -0.00084, "length-off", "279.99.|280.00. mm in place of 280.840 mm"),
     ],
     ids=["zero", "rod"],
@@ -212,16 +222,45 @@ def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean:
     joined = with_effects(evidence, (PlacedEffect(Spring(), 1),))
     assert joined.identification.estimate is joined.estimate
     count = len(evidence.estimate.covariance)
-    extra = np.diag(np.arange(1.0, count + 1.0))
-    changed = evidence_with_geometry(joined, extra)
+    gains = len(GAINS)
+    # In another order, and with a parameter that the estimate with effects lacks, as after another turn of gravity.
+    unknowns = (Column("of another gravity", "kg m"), *reversed(evidence.estimate.unknowns))
+    extra = np.diag(np.arange(1.0, count + 2.0))
+    changed = evidence_with_geometry(joined, extra, unknowns)
     difference = np.diag(changed.estimate.covariance - joined.estimate.covariance)
     names = [column.name for column in joined.estimate.unknowns]
-    bare = [column.name for column in evidence.estimate.unknowns]
-    gains = len(GAINS)
-    expected = {name: float(number) for name, number in zip(bare, range(gains + 1, count + 1), strict=True)}
+    added = {column.name: float(number) for number, column in enumerate(unknowns, start=gains + 1)}
     assert list(difference[:gains]) == pytest.approx([1.0, 2.0, 3.0, 4.0])
-    assert list(difference[gains:]) == pytest.approx([expected.get(name, 0.0) for name in names])
+    assert list(difference[gains:]) == pytest.approx([added.get(name, 0.0) for name in names])
+    assert sum(name in added for name in names) == count - gains
     assert changed.identification.estimate is changed.estimate
+
+
+def test_the_uncertainty_of_the_geometry_is_in_sigma_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a search that adds nothing, σ is that of the fit with the corrected geometry."""
+    _read(_with_zero(0.5), monkeypatch)
+    monkeypatch.setattr(fitting, "find_effects", partial(find_effects, families=(), geometry=()))
+    fitted = fit(LOGS, keep_rows=True)
+    closed = close_loop(fitted, 0)
+    assert closed.steps[-1].after.effects == ()
+    assert closed.geometry_covariance is not None
+    bare = closed.evidence().training.system()
+    expected = estimate_with(Method.ML, bare).covariance + closed.geometry_covariance
+    assert closed.identification.estimate.covariance == pytest.approx(expected, rel=1e-6, abs=1e-15)
+    assert closed.estimate.gains_std == pytest.approx(np.sqrt(np.diag(expected))[: len(GAINS)], rel=1e-6)
+    again = close_loop(closed, 0)
+    assert again.estimate.gains_std == pytest.approx(closed.estimate.gains_std, rel=1e-6)
+
+
+def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: Fit) -> None:
+    """A gain of small σ that moves by three of them counts for more than one of large σ that moves by one."""
+    std = clean.estimate.gains_std
+    few = np.zeros(len(clean.estimate.covariance))
+    few[int(np.argmax(std))] = 1.0 * std.max()
+    many = np.zeros(len(clean.estimate.covariance))
+    many[int(np.argmin(std))] = 3.0 * std.min()
+    assert shift_in_sigmas(few, clean.estimate) == pytest.approx(1.0)
+    assert shift_in_sigmas(many, clean.estimate) == pytest.approx(3.0)
 
 
 def _finding(*corrections: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...]) -> GeometryFinding:

@@ -30,8 +30,13 @@ from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, 
 from daq.workflow.validate import cross_validate
 from daq.writeback.gates.fit import uncorrected_description
 from ident.data.run import Run
+from ident.discovery.effect_verdict import Judgement
+from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step, find_effects
+from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import PlacedEffect
+from ident.effects.geometry_corrections import ZeroOffset
 from ident.errors import Diagnosis, IdentificationError
 from ident.estimators.turned_geometry import with_gravity
 from ident.model.model import DriveTrain
@@ -270,7 +275,7 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     assert said_of_fit == bool(degrees)
 
 
-def test_a_zero_is_named_beside_declared_effects_and_not_after_a_search_without_it(
+def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
     cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = {run.name: offset(run) for run in recorded}
@@ -281,7 +286,64 @@ def test_a_zero_is_named_beside_declared_effects_and_not_after_a_search_without_
     beside_declared = description_diagnoses(replace(fitted, steps=(step,)))
     assert said(beside_declared) == {"zero-off J2"}
     after_search = description_diagnoses(replace(fitted, steps=(replace(step, declared=False),)))
-    assert after_search == ()
+    assert said(after_search) == {"zero-off J2"}
+
+
+def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_not(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = {run.name: run for run in recorded}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    fitted = fit([Path(f"r{number}") for number in range(USED)])
+    finding = Finding(
+        effect=ZeroOffset(),
+        axis=1,
+        coefficients=np.array([np.radians(-4.0)]),
+        deviations=np.array([np.radians(0.1)]),
+        probability=0.001,
+        folds_better=1.0,
+        explained=0.5,
+        error_before_percent=5.0,
+        error_after_percent=4.0,
+        error_fall=0.2,
+        held_out_fall=9.0,
+        passed=True,
+        fold_errors=np.ones(8),
+    )
+    aside = SetAside(finding, "the squared error on runs left out rises")
+    step = Step((), (), np.zeros(3), None, fitted.evidence(), set_aside=(aside,))
+    (diagnosis,) = description_diagnoses(replace(fitted, steps=(step,)))
+    assert (diagnosis.name, diagnosis.axes) == ("zero-off", ("J2",))
+    assert "off by -4.00 ± 0.10°" in diagnosis.found
+    assert "the gains are without this correction (the squared error on runs left out rises)" in diagnosis.found
+    in_its_noise = replace(step, left_open=(PlacedEffect(ZeroOffset(), 1),))
+    assert description_diagnoses(replace(fitted, steps=(in_its_noise,))) == ()
+
+
+def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A held-out run of three seconds decides nothing."""
+    short = replace(
+        recorded[6],
+        time_s=recorded[6].time_s[:600],
+        position_rad=recorded[6].position_rad[:600],
+        current_a=recorded[6].current_a[:600],
+    )
+    runs = {run.name: replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    fitted = fit([Path(f"r{number}") for number in range(USED)], holdout=[Path("r6")], keep_rows=True)
+    closed = close_loop(fitted, 0)
+    assert closed.steps[-1].after.effects == ()
+    (verdict,) = closed.steps[-1].verdicts
+    assert verdict.judgement is Judgement.UNDECIDED
+    named = [one for one in closed.diagnoses if one.name == "zero-off"]
+    assert [one.axes for one in named] == [("J2",)]
+    assert "held-out runs do not decide it" in named[0].found
+    calibration = calibration_of(closed, WHEN)
+    assert [one.name for one in uncorrected_description(calibration)] == ["zero-off"]
+    assert np.all(closed.estimate.gains_std > fitted.estimate.gains_std)
 
 
 def test_the_key_that_is_named_reverses_a_position_and_no_current(

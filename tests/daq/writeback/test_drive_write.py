@@ -138,7 +138,7 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
         proposal = _propose(cell, network)
     assert listener.downloads() == []
     assert list(tmp_path.iterdir()) == []
-    assert [change.old for change in proposal.edit.changes] == IN_DRIVES
+    assert [change.current_gain for change in proposal.edit.changes] == IN_DRIVES
     assert [change.new for change in proposal.edit.changes] == NEW
     assert proposal.edit.changes[3].key == "J4, 2003h:01"
     assert proposal.edit.before != proposal.edit.after
@@ -231,7 +231,7 @@ def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
         with pytest.raises(ObjectAccessError, match=r"J3 \(node 3\): object (2003h:01|1010h:01): aborted") as caught:
             _write(cell, address)
         restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
-        assert caught.value.__notes__ == [f"kept: the old values are restored in {', '.join(restored)}"]
+        assert caught.value.__notes__ == [f"kept: the previous values are restored in {', '.join(restored)}"]
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -336,7 +336,7 @@ def test_a_foreign_master_that_comes_midway_ends_it(
     with simulated(address) as simulation:
         with pytest.raises(BusBusy) as caught:
             _write(cell, address)
-        assert "kept: the old values are restored in J1, J2, J3" in caught.value.__notes__
+        assert "kept: the previous values are restored in J1, J2, J3" in caught.value.__notes__
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -361,7 +361,7 @@ def test_a_drive_that_keeps_something_else_is_found(
     with simulated(address) as simulation:
         with pytest.raises(ParameterRefused, match=r"reads back as -9209 .*written was -9210") as caught:
             _write(cell, address)
-        assert caught.value.__notes__ == ["kept: the old values are restored in J1, J2, J3, J4"]
+        assert caught.value.__notes__ == ["kept: the previous values are restored in J1, J2, J3, J4"]
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -590,7 +590,7 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Pa
             if writes:
                 rollback(DriveTarget(cell, network), NOW)
             else:
-                with pytest.raises(CalibrationRefused, match="1 record of the present values"):
+                with pytest.raises(CalibrationRefused, match="1 record of the current gains"):
                     rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES

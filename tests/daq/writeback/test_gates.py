@@ -639,7 +639,9 @@ def test_all_failed_checks_are_reported_at_once(scene: Scene) -> None:
 def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
     scene.controller.write_text(scene.controller.read_text().replace("7.68", "0.0"))
     reviewed = replace(scene, base=sha256(scene.controller.read_bytes()))
-    assert [(one.gate, one.subject) for one in reviewed.propose().refusals] == [(Gate.SIGN, "J6")]
+    (refusal,) = reviewed.propose().refusals
+    assert (refusal.gate, refusal.subject) == (Gate.SIGN, "J6")
+    assert refusal.found == "gain 6.79, current gain 0, nameplate 7.68"
 
 
 def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.cli.app import main
-from daq.config.signers import parse_public_key
+from daq.config.policy import parse_public_key
 from daq.documents.calibration_file import save_calibration
 from daq.errors import (
     CalibrationMissing,

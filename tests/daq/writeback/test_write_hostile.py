@@ -111,7 +111,7 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
 
 
 def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, tmp_path: Path) -> None:
-    """The other name would keep the old gains, and its readers would not know."""
+    """The other name would keep the current gains, and its readers would not know."""
     other = tmp_path / "plc's.yaml"
     other.hardlink_to(controller)
     for name in (controller, other):

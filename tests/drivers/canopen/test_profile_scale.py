@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.scale import FINE, ScaleReading, check_name_plate, read_scale
+from drivers.canopen.scale import FINE, ScaleReading, check_nameplate, read_scale
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import Amplitude, CurrentScale, ObjectEntry, RatedMotor, ScaleForm, TapPoint
@@ -65,7 +65,7 @@ def test_a_torque_without_a_unit_is_said_not_to_be_logged(lacking: int) -> None:
     assert warning == f"{without}, and its torque (6077h:00) is not logged"
 
 
-def test_a_profile_without_name_plate_says_so() -> None:
+def test_a_profile_without_rated_values_says_so() -> None:
     with drive() as (access, _):
         found = read_scale(access, PROFILE)
     assert found.rated_current_a is None
@@ -75,7 +75,9 @@ def test_a_profile_without_name_plate_says_so() -> None:
 def test_a_drive_that_was_never_set_up_has_no_ampere() -> None:
     with drive() as (access, node):
         node.store(0x6075, 0, 0)
-        with pytest.raises(SetupRefused, match=r"J1 \(node 1\): profile generic: found 6075h:00 = 0; .*name plate"):
+        with pytest.raises(
+            SetupRefused, match=r"J1 \(node 1\): profile generic: found 6075h:00 = 0; .*rated current and torque"
+        ):
             read_scale(access, RATED)
 
 
@@ -126,26 +128,26 @@ RATIO = st.floats(0.01, 100.0)
 
 @given(current_a=st.floats(0.05, 200.0), torque_nm=st.floats(0.01, 500.0), ratio=RATIO, sign=st.sampled_from((-1, 1)))
 @settings(deadline=None)
-def test_name_plates_agree_or_warn_by_their_ratio(current_a: float, torque_nm: float, ratio: float, sign: int) -> None:
+def test_nameplates_agree_or_warn_by_their_ratio(current_a: float, torque_nm: float, ratio: float, sign: int) -> None:
     reported = reading(current_a, torque_nm)
     declared = sign * torque_nm / current_a / ratio
     spread = max(ratio, 1.0 / ratio)
     if not FINE * 0.9999 < spread < FINE * 1.0001:
-        assert bool(check_name_plate(reported, Amplitude.RMS, declared)) is (spread > FINE)
+        assert bool(check_nameplate(reported, Amplitude.RMS, declared)) is (spread > FINE)
 
 
 @pytest.mark.parametrize("ratio", [math.sqrt(2.0), math.sqrt(0.5)])
 def test_peak_against_rms_is_recognised(ratio: float) -> None:
-    (found,) = check_name_plate(reading(2.0, 2.0), Amplitude.UNSTATED, 1.0 / ratio)
+    (found,) = check_nameplate(reading(2.0, 2.0), Amplitude.UNSTATED, 1.0 / ratio)
     assert "near √2" in found
     assert "unstated" in found
-    (other,) = check_name_plate(reading(2.0, 2.0), Amplitude.UNSTATED, 0.5)
+    (other,) = check_nameplate(reading(2.0, 2.0), Amplitude.UNSTATED, 0.5)
     assert "√2" not in other
 
 
 def test_what_a_drive_does_not_report_is_not_compared() -> None:
-    assert check_name_plate(reading(2.0, None), Amplitude.RMS, 1e9) == ()
-    assert check_name_plate(reading(None, None), Amplitude.RMS, 1e9) == ()
+    assert check_nameplate(reading(2.0, None), Amplitude.RMS, 1e9) == ()
+    assert check_nameplate(reading(None, None), Amplitude.RMS, 1e9) == ()
 
 
 @given(

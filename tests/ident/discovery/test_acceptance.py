@@ -14,12 +14,15 @@ from ident.discovery import acceptance
 from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
 from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.evidence import Evidence, with_effects
-from ident.discovery.loop import Step
+from ident.discovery.gates import Gates, own_unknowns
+from ident.discovery.joining import linearised
+from ident.discovery.loop import Step, end_search, find_effects
 from ident.discovery.search import Finding
+from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, Stribeck
 from ident.effects.position import Spring
-from tests.ident.recordings import Truth, acting_on, bent
+from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, with_current
 
 FloatArray = NDArray[np.float64]
 
@@ -115,6 +118,63 @@ def test_an_undecided_effect_is_reported_and_not_written_unless_asked_for(sticki
     assert asked[STICKING].written
     in_model = SPRING in kept.after.effects
     assert asked[SPRING].written == in_model
+
+
+def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) -> None:
+    """A motor saturates, and a held-out run of four moves decides nothing: without the effect, its gain is 7 % off."""
+    rng = np.random.default_rng(3)
+    runs = [
+        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=seconds)
+        for index, seconds in enumerate((22.0, 22.0, 22.0, 22.0, 5.0))
+    ]
+    linear = gathered(small_truth, tuple(runs))
+    current_a = linear.estimate.predicted_torque(linear.rows_without_effects) / small_truth.gains[:, None]
+    added_a = np.zeros_like(current_a)
+    added_a[1] = 0.3 * current_a[1] ** 3 / np.max(np.abs(current_a[1])) ** 2
+    start = with_effects(_held_out(with_current(linear, added_a), 1), ())
+    families = tuple(family for family in EFFECTS if family[0].name == "saturation")
+    steps = find_effects(start, np.random.default_rng(0), Gates(draws=199), families)
+    (saturation,) = steps[-1].after.effects
+    (*_, last) = accept_on_holdout(start, steps, axes=NAMES)
+    assert last.after.effects == ()
+    assert last.left_open == (saturation,)
+    (verdict,) = last.verdicts
+    assert verdict.judgement is Judgement.UNDECIDED
+    errors = last.after.estimate.gains - small_truth.gains
+    assert abs(errors[1]) > 3.0 * start.estimate.gains_std[1]
+    assert np.all(np.abs(errors) < 3.0 * last.after.estimate.gains_std)
+    assert last.choice_std is not None
+    assert last.after.estimate.gains_std == pytest.approx(np.hypot(start.estimate.gains_std, last.choice_std), rel=1e-6)
+
+
+def test_a_refuted_effect_adds_nothing_to_sigma(small: Evidence, small_truth: Truth) -> None:
+    fitted = _only_in(("run0", "run1", "run2"), _asymmetric)
+    start = _planted(small, small_truth, fitted)
+    (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
+    (verdict,) = last.verdicts
+    assert verdict.judgement is Judgement.REFUTED
+    assert last.left_open == ()
+    assert last.after.estimate.gains_std == pytest.approx(start.estimate.gains_std)
+
+
+def test_what_is_left_passes_every_gate_again(sticking: Evidence) -> None:
+    """A spring that is not there, with a σ that shows it: the folds and the random signs of the moves do not."""
+    steps = _steps(sticking, (STICKING, SPRING))
+    joined = with_effects(sticking, (SPRING,))
+    own = len(joined.estimate.gains) + own_unknowns(joined.estimate, joined.effects)
+    covariance = joined.estimate.covariance.copy()
+    covariance[own, :] = 0.0
+    covariance[:, own] = 0.0
+    covariance[own, own] = 1e-12
+    certain = replace(joined, estimate=replace(joined.estimate, covariance=covariance))
+    model = linearised(certain, {})
+    last = end_search(steps, model, Gates(draws=199), rng=np.random.default_rng(0))
+    assert last.after.effects == ()
+    assert last.left_open == (SPRING,)
+    assert last.set_aside[-1].words.startswith("without what has left, ")
+    # Where nothing has left, the search itself has just asked.
+    unchanged = (*steps[:-1], replace(steps[-1], after=certain))
+    assert end_search(unchanged, model, Gates(draws=199), rng=np.random.default_rng(0)).after.effects == (SPRING,)
 
 
 def test_few_held_out_moves_decide_nothing(small: Evidence, small_truth: Truth) -> None:

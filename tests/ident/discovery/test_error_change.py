@@ -84,12 +84,21 @@ def test_a_fall_is_a_rise_of_the_opposite(changes: list[float]) -> None:
 
 
 @pytest.mark.parametrize("freedom", [3, 30])
-def test_noise_falls_once_in_twenty_also_with_heavy_tails(freedom: int) -> None:
+def test_noise_falls_six_times_in_a_hundred_also_with_heavy_tails(freedom: int) -> None:
     """Two tests are made, which nearly always agree: 5 % of each become some 6 % of both."""
     rng = np.random.default_rng(11)
     draws = rng.standard_t(freedom, size=(2000, 12))
     share = np.mean([compare_by_move(draw, np.arange(12)).falls(0.95) for draw in draws])
     assert 0.035 <= share <= 0.075
+
+
+@pytest.mark.parametrize(("confidence", "expected"), [(0.95, 0.0845), (0.975, 0.0457)])
+def test_noise_falls_most_often_with_five_blocks(confidence: float, expected: float) -> None:
+    """The level that the documentation gives: two tests, each at the level that the confidence says."""
+    rng = np.random.default_rng(13)
+    draws = rng.standard_normal((3000, FEWEST_BLOCKS))
+    share = np.mean([compare_by_move(draw, np.arange(FEWEST_BLOCKS)).falls(confidence) for draw in draws])
+    assert share == pytest.approx(expected, abs=0.015)  # three deviations of 3000 draws
 
 
 def test_noise_is_confirmed_once_in_ten_at_most() -> None:

@@ -27,6 +27,7 @@ from ident.discovery.gates import (
     in_noise,
     moved_gains,
     own_unknowns,
+    possible_values,
     regions_to_leave_out,
     runs_to_leave_out,
     whitened_columns,
@@ -457,7 +458,7 @@ def test_an_effect_that_the_reported_sigma_does_not_show_leaves(sticking: Eviden
     covariance = shown.estimate.covariance.copy()
     covariance[own, own] += 1e4
     unsure = replace(shown, estimate=replace(shown.estimate, covariance=covariance))
-    last = loop.end_search(steps, joining.linearised(unsure, {}), GATES)
+    last = loop.end_search(steps, joining.linearised(unsure, {}), GATES, rng=np.random.default_rng(0))
     assert last.after.effects == ()
     assert last.set_aside[-1].finding.effect == STICKING[0]
     assert last.set_aside[-1].words.startswith("by the σ that is reported, its coefficients may all be zero")
@@ -496,6 +497,53 @@ def test_an_impossible_part_leaves_with_its_effect(sticking: Evidence) -> None:
     assert placed == joined.effects[1]
     assert "physics allows no less than 0" in why
     assert not loop._unshown(replace(wrong, declared=2))
+
+
+def test_values_that_are_not_possible_are_held_and_the_others_follow() -> None:
+    """The least squares of the same problem with the first value fixed at zero."""
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((40, 3))
+    columns[:, 1] += 0.8 * columns[:, 0]
+    measured = columns @ np.array([-0.3, 4.0, 1.0]) + 0.1 * rng.standard_normal(40)
+    covariance: FloatArray = np.linalg.inv(columns.T @ columns).astype(np.float64)
+    free = covariance @ columns.T @ measured
+    held = possible_values((Column("preload", "Nm", least=0.0),), free, covariance)
+    others = np.linalg.lstsq(columns[:, 1:], measured, rcond=None)[0]
+    assert held[0] == 0.0
+    assert held[1:] == pytest.approx(others)
+    possible = np.array([0.5, 1.0, 2.0])
+    assert np.array_equal(possible_values((Column("preload", "Nm", least=0.0),), possible, covariance), possible)
+
+
+def _warming(small: Evidence, dry_sigmas: float, viscous_sigmas: float) -> Evidence:
+    """A joint fit whose warm-up has coefficients of so many σ, independent of everything else."""
+    joined = with_effects(small, (PlacedEffect(WarmUp(10.0, 0), 1),))
+    estimate = joined.estimate
+    own = own_unknowns(estimate, joined.effects)
+    place = len(estimate.gains) + own
+    parameters = estimate.parameters.copy()
+    parameters[own] = dry_sigmas, viscous_sigmas
+    covariance = estimate.covariance.copy()
+    covariance[place, :] = 0.0
+    covariance[:, place] = 0.0
+    covariance[place, place] = 1.0
+    return replace(joined, estimate=replace(estimate, parameters=parameters, covariance=covariance))
+
+
+def test_a_part_that_is_a_little_impossible_is_held_at_the_bound_and_carries_no_test(small: Evidence) -> None:
+    warming = _warming(small, -1.9, 8.0)
+    assert not loop._unshown(warming)
+    held = loop.with_possible_values(warming)
+    own = own_unknowns(held.estimate, held.effects)
+    assert held.estimate.parameters[own] == pytest.approx([0.0, 8.0])
+    assert held.estimate.gains == pytest.approx(warming.estimate.gains)
+    assert np.array_equal(held.estimate.covariance, warming.estimate.covariance)
+    # By Wald's test of both, p = 0.03; of what is possible of it, p = 0.14.
+    ((_, why, _),) = loop._unshown(_warming(small, -1.8, 2.0))
+    assert "may all be zero" in why
+    ((_, why, _),) = loop._unshown(_warming(small, -2.1, 8.0))
+    assert "physics allows no less than 0" in why
+    assert loop.with_possible_values(replace(warming, declared=1)).estimate is warming.estimate
 
 
 def test_a_hose_only_pulls_and_a_current_is_early_by_milliseconds() -> None:

@@ -174,6 +174,11 @@ def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     assert (accepted.name, accepted.axis, accepted.settings) == ("zero-offset", "J2", {})
     assert accepted.coefficients[0].value == pytest.approx(-ZERO_RAD, abs=0.002)
     last = steps[-1].after
+    # Its verdict is that of all motors together, and so are its errors.
+    assert start.holdout_error is not None
+    assert last.holdout_error is not None
+    assert accepted.error_before_percent == pytest.approx(start.holdout_error.total)
+    assert accepted.error_after_percent == pytest.approx(last.holdout_error.total)
     data = start.datasets[-1]
     predicted = predict_current(calibration, start.model, data)
     moving = data.motor_moving.all(axis=1)

@@ -14,7 +14,8 @@ from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
+from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia, refined_rotor
+from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.effects.transmission import Efficiency
@@ -224,3 +225,19 @@ def test_a_declared_inertia_is_kept(heavy: Evidence) -> None:
 def test_a_declared_inertia_that_is_a_parameter_of_its_own_is_refused(heavy: Evidence) -> None:
     with pytest.raises(EffectRefused, match="J3 is given a rotor"):
         with_declared(heavy, [PlacedEffect(Efficiency(1.0, 0.1), 2)], np.random.default_rng(0), axes=NAMES)
+
+
+@pytest.mark.parametrize("name", [LoadFriction.name, Efficiency.name])
+def test_no_rotor_has_a_negative_inertia(name: str, heavy: Evidence) -> None:
+    """J + d/c is not negative: beside J = 0 its rest is not either, and a rotor that is certainly negative is none."""
+    dictionary = {family[0].name: family[0] for family in EFFECTS}
+    without = dictionary[name].with_settings({"with_rotor": 1, "rotor_inertia_kg_m2": 0.0})
+    beside = without.with_settings({"rotor_inertia_kg_m2": 0.2})
+    assert without.coefficients[1].least == 0.0
+    assert beside.coefficients[1].least == -np.inf
+    problem = search_problem_of(heavy)
+    deviations = np.array([0.01, 0.01])
+    certain = refined_rotor(problem, without, 0, np.array([0.1, -0.05]), deviations)
+    assert certain.settings["with_rotor"] == 0
+    may_be_zero = refined_rotor(problem, without, 0, np.array([0.1, -0.015]), deviations)
+    assert may_be_zero == without

@@ -1,0 +1,52 @@
+"""`drivegain calibrate`: what its terminal shows while a block is recorded."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from daq.cli.calibrate import Looks
+from daq.jobs.journal import Form
+from daq.jobs.story import Story
+from daq.log.feed import Feed, QuickGain, QuickLook
+
+LOOK = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)])
+
+
+@pytest.fixture
+def looks(tmp_path: Path) -> Looks:
+    """While the second block is recorded."""
+    story = Story(io.StringIO(), Form.TEXT, lambda: datetime(2026, 1, 5, tzinfo=UTC))
+    return Looks(Feed(tmp_path / "cell.yaml"), story, block=LOOK.block)
+
+
+def test_a_look_is_printed_where_the_errors_go_now(looks: Looks, capsys: pytest.CaptureFixture[str]) -> None:
+    """A progress bar replaces the stream while it is shown."""
+    looks.show(LOOK)
+    looks.show(replace(LOOK, move=4))
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in said] == [
+        "Quick estimate after move 3 of 9",
+        "Quick estimate after move 4 of 9",
+    ]
+
+
+def test_a_look_that_comes_after_its_block_does_not_disturb_the_operator(
+    looks: Looks, capsys: pytest.CaptureFixture[str]
+) -> None:
+    looks.block = ""
+    looks.show(LOOK)
+    looks.block = "block-3-held-out"
+    looks.show(LOOK)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_missing_is_printed_once_in_a_block(looks: Looks, capsys: pytest.CaptureFixture[str]) -> None:
+    waiting = replace(LOOK, gains=[], missing="no payload")
+    for move in (1, 2, 3):
+        looks.show(replace(waiting, move=move))
+    assert capsys.readouterr().err == "No gains yet: no payload.\n"

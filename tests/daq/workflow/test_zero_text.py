@@ -1,0 +1,91 @@
+"""The words for a zero that is off: one number and one sign, by torque, by encoders, and on the certificate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from daq.report.gains import encoder_text
+from daq.workflow.diagnoses import check_diagnoses
+from daq.workflow.geometry_diagnoses import encoder_misfit_of, geometry_diagnoses
+from daq.workflow.zero_text import zero_decimals, zero_off_text
+from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.search import Finding
+from ident.effects.geometry_corrections import ZeroOffset
+from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
+from ident.model.geometry import GeometryKind, GeometryParameter
+
+DECLARED_TOO_LARGE_DEG = (2.0, -2.0)
+STD_DEG = 0.04
+
+
+def _by_torque(value_rad: float) -> Finding:
+    """A finding by torques: the offset that has to be added to the position of the second axis."""
+    return Finding(
+        effect=ZeroOffset(),
+        axis=1,
+        coefficients=np.array([value_rad]),
+        deviations=np.array([radians(STD_DEG)]),
+        probability=0.001,
+        folds_better=1.0,
+        explained=0.5,
+        error_before_percent=5.0,
+        error_after_percent=4.0,
+        error_fall=0.2,
+        held_out_fall=9.0,
+        passed=True,
+        fold_errors=np.ones(8),
+    )
+
+
+def _by_encoders(value_rad: float) -> GeometryFinding:
+    """A finding by redundant encoders, of the second axis of a closed chain."""
+    parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
+    correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
+    return GeometryFinding(4e-4, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ())
+
+
+@pytest.mark.parametrize("too_large_deg", DECLARED_TOO_LARGE_DEG)
+def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(checkout: Path, too_large_deg: float) -> None:
+    """A zero that is declared 2° too large is off by -2°, and the cell file is right with that added."""
+    value_rad = -radians(too_large_deg)
+    right_deg = 10.0
+    said = f"{-too_large_deg:+.2f} ± 0.04° (to be added to its position)"
+    typed = f"add {-too_large_deg:+.2f} to `zero_offset_deg` of {{}} in the cell file, which makes it {right_deg:.2f},"
+
+    serial = load_cell(checkout / "configs/cells/demo.yaml")
+    declared = replace(serial.axes[1], zero_offset_rad=radians(right_deg + too_large_deg))
+    serial = replace(serial, axes=(serial.axes[0], declared, *serial.axes[2:]))
+    check = GeometryCheck(gravity=None, mistake=_by_torque(value_rad), hidden_zeros=())
+    (by_torque,) = check_diagnoses(check, serial, model_of(serial))
+    name = declared.name
+    assert by_torque.found == f"the zero of {name} off by {said}"
+    assert by_torque.remedy.startswith(typed.format(name))
+
+    closed = load_cell(checkout / "configs/cells/dualv.yaml")
+    crank = replace(closed.axes[1], zero_offset_rad=radians(right_deg + too_large_deg))
+    closed = replace(closed, axes=(closed.axes[0], crank, *closed.axes[2:]))
+    finding = _by_encoders(value_rad)
+    (by_encoders,) = geometry_diagnoses(finding, closed, applied=False)
+    assert f"the zero of crank-2 off by {said}" in by_encoders.found
+    assert by_encoders.remedy.startswith(typed.format("crank-2"))
+
+    misfit = encoder_misfit_of(finding, closed, applied=False)
+    assert misfit is not None
+    assert f"the zero of crank-2 off by {said}" in encoder_text(misfit)
+
+
+def test_a_zero_of_a_slide_is_in_millimetres() -> None:
+    text = zero_off_text("J1", 3.0, 0.05, "mm")
+    assert text == "the zero of J1 off by +3.00 ± 0.05 mm (to be added to its position)"
+
+
+@pytest.mark.parametrize(("std", "decimals"), [(0.4, 2), (0.04, 2), (0.004, 3), (0.0004, 4), (1e-7, 4), (0.0, 4)])
+def test_a_zero_has_the_decimals_that_its_deviation_leaves(std: float, decimals: int) -> None:
+    assert zero_decimals(std) == decimals
