@@ -77,6 +77,46 @@ class CurrentUnsigned(DataUnfit):
         self.axes = axes
 
 
+class ChannelUnfit(DataUnfit):
+    """A channel of a recording shows by itself that it cannot be used."""
+
+    def __init__(self, run: str, axes: tuple[str, ...], *, found: str, expected: str, remedy: str) -> None:
+        names = ", ".join(axes)
+        self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+        super().__init__(run, f"axis {names}: found {found}; expected {expected}; {remedy}")
+        self.axes = axes
+
+
+class JointStill(ChannelUnfit):
+    """A joint never moves in a run, or in all runs with one payload."""
+
+    def __init__(self, run: str, axes: tuple[str, ...], found: str) -> None:
+        super().__init__(
+            run,
+            axes,
+            found=found,
+            expected="a joint that moves in runs without load and in runs with each payload",
+            remedy="if it stood still, record this run again with moves of every joint; if it moved, check its encoder "
+            "or the column of its position",
+        )
+
+
+class CurrentConstant(ChannelUnfit):
+    """A motor moves, and its current has one value."""
+
+    def __init__(self, run: str, axes: tuple[str, ...], size: float) -> None:
+        super().__init__(
+            run,
+            axes,
+            found="a current that is zero throughout" if size == 0.0 else f"a current of {size:.4g} throughout",
+            expected="the changing current of a motor that moves",
+            remedy="is its channel connected, and the object or column the right one? record this run again",
+        )
+
+
 class ModelContradicted(IdentificationError):
     """The declared model explains less of the data than it leaves."""
 
@@ -110,6 +150,10 @@ class UnitsMistaken(ModelContradicted):
 
 class PayloadDiffers(ModelContradicted):
     """A run carries another payload than it says."""
+
+
+class MassesContradict(ModelContradicted):
+    """The torques deny the masses of several payloads together."""
 
 
 class TooFewMoves(IdentificationError):
@@ -179,10 +223,10 @@ GAIN_UNSEEN = "gain-unseen"  #: Diagnosis of a gain that the moves hardly show
 class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
-    #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-late, current-off-scale,
-    #: current-reversed, estimators-disagree, gain-off-nameplate, gain-unseen, geometry-off, gravity-tilted,
-    #: gravity-turned, ill-conditioned, length-off, payload-differs, place-off, position-late, position-reversed,
-    #: time-skew, torque-above-limit, zero-off, zero-turned.
+    #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-clipped, current-late,
+    #: current-off-scale, current-reversed, estimators-disagree, gain-off-nameplate, gain-unseen, geometry-off,
+    #: gravity-tilted, gravity-turned, ill-conditioned, joint-still, length-off, masses-contradict, payload-differs,
+    #: place-off, position-late, position-reversed, time-skew, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -249,6 +249,8 @@ class _Verbs(TyperGroup):
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
             nothing = "nothing was changed" if writes else "no file was written"
             said = _kept() or "; ".join(all_notes(interrupt)) or nothing
+            if ctx.invoked_subcommand == "demo" and any(path.exists() for path in STARTED):
+                said += "; the next `drivegain demo` into this folder starts anew and replaces it"
             say_last(printable(f"interrupted: {said}"))
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from daq.report.document import ErrorReport
 
 WITH_EVIDENCE = (
-    identification.ModelContradicted | identification.PayloadMissing | identification.CurrentUnsigned
+    identification.ModelContradicted
+    | identification.PayloadMissing
+    | identification.CurrentUnsigned
+    | identification.ChannelUnfit
 )  #: Errors of the identification that have found, expected and remedy
 NOTES = ("kept", "hint")
 """Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""
@@ -146,8 +149,22 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
         driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain scan CELL` lists the nodes"),
         driver.BusBusy: ("no other master on the bus", "end the other program"),
     },
+    # Its cell is simulated and has no file: no other verb can look at it.
+    "demo": {
+        driver.DriverError: (
+            "a simulated cell that answers in time",
+            "close other programs, because a busy computer answers late, and run `drivegain demo` again; with the same "
+            "error on an idle one, choose another --seed",
+        ),
+        identification.IdentificationError: (
+            "five runs that identify every gain",
+            "run `drivegain demo` again with a longer --duration or another --seed",
+        ),
+    },
 }
 """The same within a verb that `ADVICE` would propose to run: its user has just done so."""
+
+RESET = "; then reset the fault with `CanopenNetwork.reset_faults`"  #: How a message about a fault may end
 
 _BY_NUMBER: dict[int, tuple[str, str, str]] = {
     errno.ECONNREFUSED: (
@@ -271,11 +288,14 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
         known = _BY_NUMBER.get(_number(error) or 0)
         if known is not None:
             return f"bus {error.address}", *known
-    if isinstance(error, driver.MotionRefused) and error.remedy:
+    if isinstance(error, driver.MotionRefused) and error.remedy and verb != "demo":
         return "motion is refused", error.found, error.expected, error.remedy
-    known_advice = ADVICE | ADVICE_WITHIN.get(verb, {})
+    known_advice = ADVICE_WITHIN["demo"] if verb == "demo" else ADVICE | ADVICE_WITHIN.get(verb, {})
     advice = next((known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", ""))
-    return str(error), str(error), *advice
+    said = str(error)
+    if verb == "demo":
+        said = said.replace(RESET, "")
+    return said, said, *advice
 
 
 def _number(error: BaseException | None) -> int | None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.plan import Plan
     from ident.calibration import Calibration
+    from ident.errors import Diagnosis
 
 LARGEST_FOLDER_BYTES = 100_000_000
 """Size of all logs of a folder up to which they are read for a hint [bytes]: that takes about a second."""
@@ -50,6 +51,11 @@ def _needs_other_moves(calibration: Calibration) -> bool:
     from ident.errors import CORRECTION_UNCLEAR, GAIN_UNSEEN
 
     return any(one.name in (CORRECTION_UNCLEAR, GAIN_UNSEEN) for one in calibration.diagnoses)
+
+
+def say_look_first() -> None:
+    """Print on stderr that a cause has to be found before anything is written."""
+    typer.echo("Next: find the cause of what CHECK says, before any gain is written.", err=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,19 +186,43 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], written
     say_next("drivegain", "residual", *arguments, "--out", out, "--report", "report")
 
 
-def say_after_calibration(calibration: Calibration, file: Path, logs: Sequence[Path], cell: Path | None) -> None:
-    """Name the dry run that shows what would be written.
+def say_after_calibration(
+    calibration: Calibration,
+    file: Path,
+    logs: Sequence[Path],
+    cell: Path | None,
+    diagnoses: Sequence[Diagnosis] | None = None,
+) -> None:
+    """Name the dry run that shows what would be written, unless there is something to correct before.
 
-    It is not named where the gains were held, the description is wrong, or other moves are needed.
+    Args:
+        calibration: that could be written.
+        file: it is in.
+        logs: of the command.
+        cell: its file; None where the command was given none.
+        diagnoses: that the command has printed; those of the calibration when None.
     """
-    from daq.writeback.gates.fit import uncorrected_description
+    from daq.writeback.gates.fit import OF_DESCRIPTION
+    from daq.writeback.gates.table import check_calibration
 
     if _needs_other_moves(calibration):
         _say_record_more()
-    elif uncorrected_description(calibration):
+        return
+    printed = calibration.diagnoses if diagnoses is None else diagnoses
+    if any(one.name in OF_DESCRIPTION for one in printed):
         say_correct_first()
-    elif not calibration.gains_fixed:  # every gate of such gains is closed
-        say_next("drivegain", "apply", cell or cell_of(calibration, logs), file)
+        return
+    if calibration.gains_fixed:  # every gate of such gains is closed
+        return
+    if printed:
+        say_look_first()
+        return
+    refusals = check_calibration(calibration)
+    if refusals:
+        subject, found, _, remedy = refusals[0]
+        typer.echo(f"Next: {remedy}. `drivegain apply` refuses this calibration: {subject}: {found}.", err=True)
+        return
+    say_next("drivegain", "apply", cell or cell_of(calibration, logs), file)
 
 
 def cell_of(calibration: Calibration, logs: Sequence[Path]) -> Path:

@@ -355,7 +355,7 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
             if console.is_terminal:
                 spinner.update(terminal_text(step))
             else:
-                console.print(f"  {step}", style="dim")
+                console.print(f"  {step}", style="dim", soft_wrap=True)  # a line of a file, whatever its length
 
         yield show_step
 

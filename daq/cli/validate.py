@@ -72,7 +72,7 @@ def validate_verb(
         print_json(validate_report(known, found, drawn))
     else:
         print_view(validation_view(known, found), *drawn.values(), page_file)
-        say_after_calibration(known, calibration, logs, cell)
+        say_after_calibration(known, calibration, logs, cell, found.diagnoses)
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:

@@ -212,6 +212,20 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
     """Refuse runs without motion: radians taken for degrees shrink it 57 times, which limits do not reveal."""
     ranges = [axis.limits.position[1] - axis.limits.position[0] for axis in cell.axes]
     share = np.ptp(joint_rad, axis=0) / np.array(ranges)
+    still = [axis.name for axis, range_share in zip(cell.axes, share, strict=True) if range_share == 0.0]
+    if len(still) == len(cell.axes):
+        raise PositionImplausible(
+            name,
+            found="positions that never change, on any axis",
+            expected="a recording of an arm that moves",
+            remedy="did the axes move? check the columns of `position` in the description",
+        )
+    if still:
+        _LOG.warning(
+            "warning: %s: the position of %s never changes; if it moved, check its encoder or its column",
+            name,
+            " and ".join(still),
+        )
     if share.max() < SMALLEST_MOTION:
         raise PositionImplausible(
             name,

@@ -63,7 +63,8 @@ def residual_view(
         yield ""
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    yield gain_table(calibration.gains, title="Drive gains with the effects; change % is from the nameplate")
+    gains = "Drive gains with the effects" if calibration.effects else "Drive gains"
+    yield gain_table(calibration.gains, title=f"{gains}; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(

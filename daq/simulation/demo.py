@@ -119,7 +119,10 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(cell_file)
     out = settings.out
-    make_room(out, tuple(out / f"{name}.mcap" for name, _, _ in RUNS))
+    replaced = make_room(out, tuple(out / f"{name}.mcap" for name, _, _ in RUNS))
+    if replaced:
+        names = ", ".join(log.name for log in replaced)
+        reporter.step(f"start anew: {names} of an earlier demonstration are recorded again and replaced")
     reporter.step("scan the bus")
     with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
         nodes = network.scan()
@@ -358,8 +361,16 @@ def _recorded(run: Recorded) -> DemoLog:
     )
 
 
-def make_room(out: Path, logs: tuple[Path, ...]) -> None:
-    """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours."""
+def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours.
+
+    Args:
+        out: the folder.
+        logs: that the demonstration will record in it.
+
+    Returns:
+        those of the logs that were there.
+    """
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
         raise UsageError(
             str(out),
@@ -369,6 +380,7 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> None:
         )
     out.mkdir(parents=True, exist_ok=True)
     replace_file(out / MARK, b"Made by `drivegain demo`, which may replace what is in this folder.\n")
+    replaced = tuple(log for log in logs if log.is_file())
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)
@@ -377,6 +389,7 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> None:
     # The audit and its head: the copy of the controller file is a new one.
     for older in (out / AUDIT, head_file(out / AUDIT)):
         older.unlink(missing_ok=True)
+    return replaced
 
 
 @contextmanager

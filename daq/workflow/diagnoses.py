@@ -466,7 +466,7 @@ CORRECTED_BY: dict[type[Effect], str] = {
     TimeSkew: "time-skew",
 }
 """Diagnosis of a wrong description, or of currents that are late, by the effect that corrects it."""
-OF_DESCRIPTION = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
+HIDING_EXCHANGES = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
 """Those of a wrong description, which may look like exchanged currents."""
 SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
 INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"

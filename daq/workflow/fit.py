@@ -21,7 +21,7 @@ from daq.files import sha256
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.diagnoses import (
-    OF_DESCRIPTION,
+    HIDING_EXCHANGES,
     Recordings,
     by_likelihood,
     check_diagnoses,
@@ -345,7 +345,7 @@ def judged(fitted: Fit) -> Fit:
     of_description = description_diagnoses(fitted)
     recordings = fitted.recordings
     # What is wrong with the description must not be blamed on the wiring.
-    if any(one.name in OF_DESCRIPTION for one in of_description):
+    if any(one.name in HIDING_EXCHANGES for one in of_description):
         recordings = replace(recordings, channels_as_wired=True)
     of_fit = diagnose_fit(
         fitted.final,

@@ -19,13 +19,14 @@ from daq.config.cell import Cell, model_of
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.diagnoses import drift_diagnosis, with_verbs
+from daq.workflow.diagnoses import CORRECTED_BY, drift_diagnosis, with_verbs
 from daq.workflow.geometry_diagnoses import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.data.run_channels import channels_of, clip_diagnoses, require_live_currents, still_diagnoses
 from ident.effects.dictionary import GEOMETRY as CORRECTION_FAMILIES
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import TemperatureFriction
@@ -406,7 +407,7 @@ def cross_validate(
         except IdentificationError as error:
             rows = str(error)
         weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(of_cell_now, rows, kg)))
-    stored = not_repeated(calibrations[first].diagnoses, diagnoses)
+    stored = not_repeated(not_corrected_since(calibrations[first], described), diagnoses)
     return CrossValidation(
         axes=tuple(gain.axis for gain in calibrations[first].gains),
         calibrations=dict(calibrations),
@@ -505,6 +506,9 @@ def diagnose_run(
         run: as it was read.
         standard: equations of this run alone, in standard parameters (`reduce_runs`).
         conditioning: the filters.
+
+    Raises:
+        CurrentConstant: a motor moves, and its current has one value.
     """
     if any(one.name in GEOMETRY for one in calibration.diagnoses):
         return ()  # it predicts in a wrong geometry
@@ -521,12 +525,16 @@ def diagnose_run(
     left = _rms(left_nm, use)
     idle = idle_joints(model, size, left)
     used = use & ~idle[:, None]
+    channels = (channels_of(model, data),)
+    require_live_currents(channels[0], axes)
+    of_channels = (*still_diagnoses(channels, axes), *clip_diagnoses(channels, axes))
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
         found += _payload_diagnoses(calibration, run.payload, standard)
     errors = list(map(with_verbs, axis_error_diagnoses(size, left, idle, axes, runs)))
-    if not errors and not any(one.name == "current-reversed" for one in found):
-        return tuple(found)
+    is_right = not errors and not any(one.name == "current-reversed" for one in found)
+    if is_right or of_channels:  # a fault of a channel is the cause of the others
+        return (*of_channels, *(found or errors))
     turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), _gains(calibration))
     if turned is not None:
         return (turned.diagnosis(axes, runs),)
@@ -622,6 +630,28 @@ def _remaining(accepted: AcceptedEffect, calibration: Calibration, cell: Cell) -
     by_name = dict(zip((column.name for column in placed.columns), left, strict=True))
     coefficients = tuple(replace(one, value=float(by_name[one.name])) for one in accepted.coefficients)
     return replace(accepted, coefficients=coefficients)
+
+
+SAME_SIGMAS = 3.0  #: Of a correction: what is left of it after the cell file was corrected is its own noise
+
+
+def not_corrected_since(calibration: Calibration, cell: Cell) -> tuple[Diagnosis, ...]:
+    """Diagnoses of a calibration, less those of numbers that the cell file has right since.
+
+    Args:
+        calibration: of the cell, at any date.
+        cell: as it is described now.
+    """
+    corrected: set[tuple[str, str | None]] = set()
+    for accepted in calibration.effects:
+        placed, _ = placed_effect(accepted, calibration)
+        if accepted.described is None or _described(placed, cell) in {None, accepted.described}:
+            continue
+        left = _remaining(accepted, calibration, cell)
+        if all(abs(one.value) <= SAME_SIGMAS * one.std for one in left.coefficients):
+            axis = accepted.axis if placed.effect.has_axis else None
+            corrected.add((CORRECTED_BY[type(placed.effect)], axis))
+    return tuple(one for one in calibration.diagnoses if (one.name, next(iter(one.axes), None)) not in corrected)
 
 
 def _described(placed: PlacedEffect, cell: Cell) -> tuple[float, ...] | None:

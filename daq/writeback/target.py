@@ -21,6 +21,7 @@ from daq.files import sha256
 from daq.ledger.audit import GONE, AuditAction, AuditEntry, digest_now
 from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
+from daq.writeback.gates.fit import OF_DESCRIPTION
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
@@ -102,7 +103,19 @@ class Proposal(Generic[E]):
 
     @property
     def error(self) -> CalibrationRefused:
-        """The error for a proposal with failed checks; several are listed one a line."""
+        """The error for a proposal with failed checks, with what its fit found wrong in the description."""
+        error = self._refusal
+        said = {(refusal.found, refusal.remedy) for refusal in self.refusals}
+        for diagnosis in self.request.calibration.diagnoses:
+            is_said = (diagnosis.found, diagnosis.remedy) in said
+            if diagnosis.name in OF_DESCRIPTION and not is_said:
+                error.add_note(f"hint: the fit of this calibration found {diagnosis.found}; {diagnosis.remedy}")
+                break
+        return error
+
+    @property
+    def _refusal(self) -> CalibrationRefused:
+        """The failed checks; several are listed one a line."""
         if len(self.refusals) == 1:
             only = self.refusals[0]
             return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)

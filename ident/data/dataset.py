@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
+from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
@@ -46,6 +47,8 @@ class Dataset:
     demanded: Motion | None = None
     #: Temperature of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
+    #: Samples whose current a limit has clipped, unreported; they are not valid. None where nobody looked.
+    clipped: BoolArray | None = None
     is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 
     def motion(self, part: slice = slice(None)) -> Motion:
@@ -84,7 +87,9 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     position, velocity, acceleration = central_differences(smooth, rate)
     speed = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))
     moving, motor_moving = moving_samples(velocity, speed, drive_train)
-    valid = np.ones_like(moving).T if usable is None else np.asfortranarray(usable[1:-1], dtype=np.bool_)
+    valid = np.ones_like(moving).T if usable is None else np.array(usable[1:-1], dtype=np.bool_, order="F")
+    clipped = clipped_samples(current[1:-1], valid & motor_moving.T)
+    valid &= ~clipped
     # If the log has no moves, a new one begins after every standstill of all joints.
     any_moving = np.any(moving, axis=0)
     move = np.cumsum(np.diff(any_moving.astype(np.int64), prepend=1) > 0) if logged is None else logged[1:-1]
@@ -107,6 +112,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         payload=run.payload,
         started_s=run.started_s,
         temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
+        clipped=clipped,
     )
 
 

@@ -15,6 +15,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import Demands, as_demanded, with_demand
 from ident.data.run import Run
+from ident.data.run_channels import channels_of
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
@@ -71,7 +72,8 @@ class Evidence:
         """The estimate with its equations reduced, effects among them; kept, because reducing takes long."""
         if not self._identification:
             training, holdout = self.training.system(), None if self.holdout is None else self.holdout.system()
-            found = Identification(self.model, self.conditioning, training, holdout, self.estimate)
+            channels = tuple(channels_of(self.model, data) for data in self.fit_runs)
+            found = Identification(self.model, self.conditioning, training, holdout, self.estimate, channels=channels)
             self._identification.append(found)
         return self._identification[0]
 

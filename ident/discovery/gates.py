@@ -189,11 +189,15 @@ class PartsLeftOut:
         part_of = folds.linearisation.of_clusters(part_of_row)
         hessian = folds.cluster_hessian
         score = folds.cluster_score
+        seen_by_all = np.diag(hessian.sum(axis=0))
         others: list[_Others | None] = []
         for part in range(int(part_of_row.max()) + 1):
+            if part not in left_out:
+                others.append(None)
+                continue
             rest = part_of != part
-            fit = _Others(_factor(hessian[rest].sum(axis=0)), score[rest].sum(axis=0)) if part in left_out else None
-            others.append(fit)
+            factor = _factor(hessian[rest].sum(axis=0), seen_by_all)
+            others.append(_Others(factor, score[rest].sum(axis=0)))
         return cls(search_problem, name, part_of, tuple(others) if left_out else ())
 
     def change(self, columns: FloatArray) -> ErrorChange:
@@ -314,7 +318,8 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
             part[seen == place] += lost * passed * problem.noise[motor] * scale
     # Around the estimate, from which the torque was taken.
     residual = problem.residual + problem.jacobian @ search_problem.step + torque
-    step = linalg.cho_solve(_factor(sum_of_squares(rest)), rest.on_columns(residual))
+    hessian = sum_of_squares(rest)
+    step = linalg.cho_solve(_factor(hessian, np.diag(hessian)), rest.on_columns(residual))
     reduced = replace(
         problem,
         jacobian=rest,
@@ -350,8 +355,13 @@ def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, f
     return tuple((motor, float(size)) for motor, size in enumerate(times) if size > 1.0)
 
 
-def _factor(hessian: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are."""
-    regular = hessian + RIDGE * np.diag(np.diag(hessian))
+def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, bool]:
+    """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are.
+
+    Args:
+        hessian: of some rows, shape (f, f). An effect that acts at one end of the workspace may have none among them.
+        seen_by_all: diagonal of JᵀJ of all rows, positive, shape (f,).
+    """
+    regular = hessian + RIDGE * np.diag(seen_by_all)
     factor, _ = linalg.cho_factor(regular, lower=True)
     return factor, True

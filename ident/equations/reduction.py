@@ -24,7 +24,7 @@ from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, motor_columns, rows_of
 from ident.equations.system import Equations, System
 from ident.equations.triangles import Triangles, qr_update, triangle
-from ident.errors import DataUnfit
+from ident.errors import DataUnfit, JointStill
 from ident.model.base import SMALLEST_COLUMN, BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, DriveTrain, Model
@@ -396,7 +396,7 @@ def regrouped(
             when None.
 
     Raises:
-        DataUnfit: a joint never moves, where the base parameters are looked for.
+        JointStill: a joint never moves, where the base parameters are looked for.
     """
     if base is None:
         base = shown_base(standard)
@@ -431,12 +431,13 @@ def shown_base(standard: System) -> BaseParameters:
     """The base parameters that a system in standard parameters shows.
 
     Raises:
-        DataUnfit: a joint never moves.
+        JointStill: a joint never moves.
     """
     for joint, rows in enumerate(standard.joints.rows):
         if not rows:
-            reason = f"{standard.model.robot.axes[joint].name} never moves faster than its standstill speed in any run"
-            raise DataUnfit(", ".join(standard.runs), reason)
+            name = standard.model.robot.axes[joint].name
+            found = f"{name} never moves above its standstill speed in any run"
+            raise JointStill(", ".join(standard.runs), (name,), found)
     names = tuple(column.name for column in standard.columns)
     return base_parameters(_linear_columns(standard)[:, : len(names)], names)
 

@@ -226,9 +226,11 @@ def require_distinct(system: System, *, gains: bool) -> None:
     independent = base_parameters(columns, names).independent
     lost = tuple(name for index, name in enumerate(names) if index not in independent)
     if lost:
-        raise RankDeficient(
-            "the data do not distinguish payload and robot: record the same robot without load too", lost
+        is_bare_seen = any(mounting < 0 for _, mounting in system.cluster_runs)
+        missing = (
+            "move every joint through more of its range" if is_bare_seen else "record the same robot without load too"
         )
+        raise RankDeficient(f"the data do not distinguish payload and robot: {missing}", lost)
     if gains:
         for motor, factor in enumerate(system.motors.factors):
             own = motor if system.leading > 1 else 0

@@ -22,6 +22,7 @@ from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.data.run_channels import clip_diagnoses, still_diagnoses
 from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
 from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
@@ -39,6 +40,7 @@ from ident.estimators.refusals import (
     numbers_text,
     refuse_mistakes,
     weight_ratio,
+    with_channel_causes,
 )
 from ident.model.model import Model
 from ident.plausible import CURRENT_RANGE, GAIN_RANGE, TORQUE_RATIO, WEIGHT_RATIO, range_text
@@ -83,11 +85,31 @@ def diagnose(
     Raises:
         PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: see `refuse_mistakes`.
         PayloadDiffers: see `payload_diagnoses`.
+        JointStill: a joint never moves in a run, in place of an error that this explains.
     """
+    with with_channel_causes(found.channels, axes):
+        return tuple(_diagnoses(found, axes, nameplate, effort_limit))
+
+
+TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}
+"""Diagnoses that an encoder may leave which stood still while its joint moved. One of a joint at rest leaves none."""
+
+
+LARGEST_SCATTER = 0.03
+"""Relative σ of every gain that is no trace: recordings that do not contradict each other give 1 % on most axes."""
+
+
+def _diagnoses(
+    found: Identification,
+    axes: Sequence[str],
+    nameplate: FloatArray | None,
+    effort_limit: FloatArray | None,
+) -> Sequence[Diagnosis]:
+    """Refuse mistakes, and name all others; see `diagnose`."""
     system = found.system
     estimate = judged_estimate(system, found.estimate)
     refuse_mistakes(system, estimate, axes, nameplate)
-    diagnoses = list[Diagnosis]()
+    diagnoses = list(clip_diagnoses(found.channels, axes))
     if nameplate is not None and not estimate.gains_fixed:
         diagnoses += gain_diagnoses(estimate, nameplate, axes)
     diagnoses += estimator_diagnoses(found.estimate, estimate, axes)
@@ -106,6 +128,10 @@ def diagnose(
         diagnoses += payloads or error_diagnoses(found.model, unseen, estimate, axes, unseen.seen_runs)
     if effort_limit is not None:
         diagnoses += torque_diagnoses(system, estimate, effort_limit)
+    scatter = estimate.gains_std / np.abs(estimate.gains)
+    has_scatter = not estimate.gains_fixed and float(np.min(scatter)) > LARGEST_SCATTER
+    if has_scatter or any(one.name in TRACES_OF_STILL_JOINTS for one in diagnoses):
+        diagnoses = [*still_diagnoses(found.channels, axes), *diagnoses]
     return (*diagnoses, *condition_diagnoses(found.estimate))
 
 

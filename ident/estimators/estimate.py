@@ -12,6 +12,7 @@ from ident.arrays import BoolArray, FloatArray
 if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no LAPACK
     from ident.data.conditioning import Conditioning
     from ident.data.dataset import Dataset
+    from ident.data.run_channels import RunChannels
     from ident.equations.instants import Instants
     from ident.equations.observation import Observation
     from ident.equations.system import System
@@ -107,6 +108,7 @@ class Identification:
     estimate: Estimate  #: from ``system`` alone
     #: All runs, held-out runs last, and their rows; none unless they were asked for.
     gathered: tuple[tuple[Dataset, ...], Observation] | None = None
+    channels: tuple[RunChannels, ...] = ()  #: faults of single channels of each run of the fit
     instants: tuple[Instants, ...] = ()  #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
 
     @property

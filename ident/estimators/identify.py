@@ -12,12 +12,13 @@ from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run
+from ident.data.run_channels import RunChannels, channels_of, require_live_currents
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
 from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
 from ident.equations.rows import Rows
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, IdentificationError, ModelError
+from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
@@ -30,6 +31,7 @@ from ident.estimators.refusals import (
     require_seen_payload,
     require_signs,
     require_weight,
+    with_channel_causes,
 )
 from ident.model.bodies import Payload
 from ident.model.model import Model
@@ -65,6 +67,8 @@ def identify(
         RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
         UnitsMistaken, CurrentReversed: with fixed gains.
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
+        CurrentConstant: see `ident.data.run_channels`.
+        JointStill: a joint never moves in a run, and the fit has no usable number for that.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
@@ -77,36 +81,42 @@ def identify(
     axes = axes or [joint.name for joint in model.robot.axes]
     used = with_signed_currents(each_run(runs), model, conditioning, axes)
     instants: list[Instants] = []
+    channels: list[RunChannels] = []
     kept: list[BuiltRun] = []
     built = rows_of_runs(model, used, conditioning, instruments=method is Method.IV and not model.is_redundant)
+    built = noting_channels(built, model, axes, channels)
     with_instants = noting_instants(built, model, conditioning, instants)
     standard = reduce_built(
         model, keeping(with_instants, kept) if keep_rows else with_instants, instruments=method is Method.IV
     )
     if not standard.runs:
         raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
+    require_moved(standard, axes)
     system = regrouped(standard)
     del standard  # its clusters hold every column
-    require_distinct(system, gains=fixed_gains is None)
-    estimate = estimate_with(method, system, fixed_gains)
-    jackknifed = estimate
-    if fixed_gains is None:
-        # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
-        # contradict each other; ml's do, where it has an estimate.
-        with suppress(IdentificationError):
-            jackknifed = estimate if method.is_of_currents else ml(system)
-        require_seen_payload(jackknifed, system)
-    if fixed_gains is not None:
-        require_weight(system, estimate)
-        require_signs(system, estimate, axes)
-    if judge:
-        idle = idle_joints(model, *joint_torques(system, estimate))
-        require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
+    with with_channel_causes(channels, axes):
+        require_distinct(system, gains=fixed_gains is None)
+        estimate = estimate_with(method, system, fixed_gains)
+        jackknifed = estimate
+        if fixed_gains is None:
+            # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that
+            # moves contradict each other; ml's do, where it has an estimate.
+            with suppress(IdentificationError):
+                jackknifed = estimate if method.is_of_currents else ml(system)
+            require_seen_payload(jackknifed, system)
+        if fixed_gains is not None:
+            require_weight(system, estimate)
+            require_signs(system, estimate, axes)
+        if judge:
+            idle = idle_joints(model, *joint_torques(system, estimate))
+            require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
     left_out = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
-    built = rows_of_runs(model, left_out, conditioning)
+    built = noting_channels(rows_of_runs(model, left_out, conditioning), model, axes, [])
     rest = reduce_built(model, keeping(built, kept) if keep_rows else built, payloads=system.payloads)
     unseen = regrouped(rest, system.base, system.payload_columns) if rest.runs else None
-    found = Identification(model, conditioning, system, unseen, estimate, instants=tuple(instants))
+    found = Identification(
+        model, conditioning, system, unseen, estimate, channels=tuple(channels), instants=tuple(instants)
+    )
     if not keep_rows:
         return found
     datasets = tuple(data for data, _ in kept)
@@ -115,6 +125,29 @@ def identify(
 
 
 BuiltRun = tuple[Dataset, Sequence[Rows]]  #: A differentiated run and its rows, piece by piece
+
+
+def require_moved(standard: System, axes: Sequence[str]) -> None:
+    """Refuse runs in none of which a joint moves.
+
+    Raises:
+        JointStill: for this joint.
+    """
+    for axis, rows in enumerate(standard.joints.rows[: len(axes)]):
+        if not rows:
+            found = f"{axes[axis]} never moves above its standstill speed in any run"
+            raise JointStill(", ".join(standard.runs), (axes[axis],), found)
+
+
+def noting_channels(
+    built: Iterable[tuple[Dataset, Iterable[Rows]]], model: Model, axes: Sequence[str], noted: list[RunChannels]
+) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
+    """Yield runs, and note the faults of their channels; refuse a current that is constant."""
+    for data, pieces in built:
+        channels = channels_of(model, data)
+        require_live_currents(channels, axes)
+        noted.append(channels)
+        yield data, pieces
 
 
 def noting_instants(

@@ -1,4 +1,7 @@
-"""Whether each run carries the payload that it says: a body that was turned, left off or exchanged, by run."""
+"""Whether each run carries the payload that it says: a body that was turned, left off or exchanged, by run.
+
+Where the declared masses of several payloads contradict each other, these are named, and no run.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from ident.equations.currents import PreloadedCurrents
 from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobians
 from ident.equations.system import System
 from ident.errors import Diagnosis, PayloadDiffers
+from ident.estimators.payload_ratio import MassContradiction, contradicting_masses
 
 LEAST_SHARE = 0.15  #: Torque of a payload's difference, relative to the payload's
 UNSEEN_SHARE = 0.3  #: The same in a held-out run, where the errors of all other parameters are in it
@@ -20,6 +24,7 @@ WRONG_SHARE = 0.6  #: The same, where the gains are not usable: a payload left o
 LEAST_OF_RESIDUAL = 0.3  #: The same, relative to the residual of the run: beside a light payload every error is large
 LARGEST_PROBABILITY = 1e-4  #: That chance makes a difference as large, over all runs
 TIED = 0.7  #: Of the largest share: two runs of one mounting contradict each other alike
+CLEARLY_LESS = 0.9  #: Sum of squares that the likelier one of two hypotheses leaves, relative to the other
 SEEN = 0.02  #: Least share of a column that must remain beside all others, to be estimated
 OF_A_BODY = np.array([0.04] * 6 + [0.2] * 3 + [1.0])
 """Sizes of the ten parameters of 1 kg that is 0.2 m off the flange: with few moves, what such a body shows most."""
@@ -36,12 +41,14 @@ class PayloadDifference:
     share: float  #: torque of the difference, relative to that of the payload (root mean squares, as currents in σ)
     #: That chance makes a difference as large: Wald test with the scatter of the moves, F distribution.
     probability: float
+    loaded: bool  #: the run says that it carries a payload
+    left: float  #: sum of squares that the difference leaves, relative to that of the fit
 
 
 def payload_diagnoses(
     system: System, gains: FloatArray, parameters: FloatArray, held: int | None = None
 ) -> Iterator[Diagnosis]:
-    """Name runs that carry another payload than they say, turned or left off.
+    """Name payloads whose masses contradict each other, or runs that carry another payload than they say.
 
     Arguments as for `payload_differences`.
 
@@ -49,10 +56,18 @@ def payload_diagnoses(
         PayloadDiffers: by more than WRONG_SHARE of its torque, in a run of the fit.
     """
     found = payload_differences(system, gains, parameters, held)
+    if held == 0:
+        masses = likeliest_masses(system, gains, parameters, found)
+        if masses is not None:
+            yield masses.diagnosis
+            return
     worst = max(found, key=lambda one: one.share, default=None)
     if worst is None:
         return
     tied = [one for one in found if one.share >= TIED * worst.share or held is None]
+    if held is not None:
+        tied = _without_unlikely_bare_runs(tied)
+        worst = max(tied, key=lambda one: one.share)
     runs = tuple(one.run for one in tied)
     evidence = (
         f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's torque, its mass by "
@@ -65,6 +80,29 @@ def payload_diagnoses(
     if held is not None and worst.share > WRONG_SHARE:
         raise PayloadDiffers(f"run {', '.join(runs)}", found=evidence, expected=expected, remedy=remedy)
     yield Diagnosis("payload-differs", runs, (), evidence, expected, remedy)
+
+
+def likeliest_masses(
+    system: System, gains: FloatArray, parameters: FloatArray, found: Sequence[PayloadDifference]
+) -> MassContradiction | None:
+    """Return the contradiction of masses, unless another payload in a single run leaves clearly less.
+
+    Args:
+        system, gains, parameters: of a fit with free gains.
+        found: of `payload_differences`.
+    """
+    masses = contradicting_masses(system, gains, parameters)
+    if masses is None or any(one.left < CLEARLY_LESS * masses.left for one in found):
+        return None
+    return masses
+
+
+def _without_unlikely_bare_runs(tied: list[PayloadDifference]) -> list[PayloadDifference]:
+    """Leave out runs without load where another payload in a loaded run explains as much."""
+    loaded = [one.left for one in tied if one.loaded]
+    if not loaded:
+        return tied
+    return [one for one in tied if one.loaded or one.left < CLEARLY_LESS * min(loaded)]
 
 
 def payload_differences(
@@ -111,7 +149,8 @@ def payload_differences(
     gram = np.sum([jacobian.T @ jacobian for jacobian, _, _ in blocks], axis=0)
     score = np.sum([jacobian.T @ e for jacobian, e, _ in blocks], axis=0)
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) if len(gram) else gram
-    mounted, found = _payload_parameters(system, parameters), []
+    total = float(np.sum([np.sum(e**2) for _, e, _ in blocks]))
+    found: list[PayloadDifference] = []
     for run, name in enumerate(system.runs):
         inside = [index for index, (owner, _) in enumerate(system.cluster_runs) if owner == run]
         if len(inside) < MIN_MOVES_TO_LEAVE_OUT:
@@ -129,16 +168,18 @@ def payload_differences(
         directions = directions[:, kept]
         amount = directions.T @ (own - cross @ (inverse @ score)) / visible[kept]
         seen = directions * OF_A_BODY[:, None]
-        difference = seen @ amount
-        body = mounted[max(0, system.cluster_runs[inside[0]][1])]  # without load, relative to the first payload
-        torque = float(np.linalg.norm(flange @ (difference / OF_A_BODY)))
+        mounting = system.cluster_runs[inside[0]][1]
+        body = _payload_parameters(system, parameters)[max(0, mounting)]  # without load, relative to the first payload
+        torque = float(np.linalg.norm(flange @ (seen @ amount / OF_A_BODY)))
         share = torque / float(np.linalg.norm(flange @ (body / OF_A_BODY)))
         left = float(np.linalg.norm(np.concatenate([blocks[index][1] for index in inside])))
         if share < least or torque < LEAST_OF_RESIDUAL * left:
             continue
         probability = _chance(blocks, inside, seen, amount, inverse @ (score - cross.T @ (directions @ amount)))
         if probability * len(system.runs) < LARGEST_PROBABILITY:
-            found.append(PayloadDifference(name, difference, share, probability))
+            explained = float(np.sum(visible[kept] * amount**2))
+            is_loaded = mounting >= 0
+            found.append(PayloadDifference(name, seen @ amount, share, probability, is_loaded, 1.0 - explained / total))
     return found
 
 

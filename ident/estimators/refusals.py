@@ -6,16 +6,29 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
+from ident.data.run_channels import RunChannels, missing_joint, still_joint
 from ident.equations.system import System
 from ident.equations.triangles import solve
-from ident.errors import CurrentReversed, ModelContradicted, PayloadUnseen, RolesExchanged, UnitsMistaken
+from ident.errors import (
+    CurrentReversed,
+    MassesContradict,
+    ModelContradicted,
+    NotConverged,
+    PayloadDiffers,
+    PayloadUnseen,
+    RankDeficient,
+    RolesExchanged,
+    UnitsMistaken,
+)
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import wls
+from ident.estimators.payload_diagnosis import likeliest_masses, payload_differences
 from ident.model.model import Model
 from ident.plausible import GAIN_RANGE, LARGEST_GAIN_STD, UNIT_RATIO, range_text
 
@@ -65,6 +78,36 @@ def refuse_mistakes(
         require_units(estimate.gains, nameplate)
 
 
+# Causes in single channels
+
+
+@contextmanager
+def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[None]:
+    """Name a joint that never moves where a fit is refused for what that leaves.
+
+    Args:
+        runs: of the fit.
+        axes: name of each axis.
+
+    Raises:
+        JointStill: in place of the error that it explains.
+    """
+    try:
+        yield
+    except RankDeficient as error:
+        still = missing_joint(runs, axes)
+        if still is None:
+            raise
+        raise still from error
+    except (ModelContradicted, NotConverged, PayloadUnseen) as error:
+        # The other contradictions have a cause of their own: signs, units or roles.
+        is_unexplained = type(error) in {ModelContradicted, NotConverged, PayloadDiffers, PayloadUnseen}
+        still = still_joint(runs, axes, "a fit that contradicts itself") if is_unexplained else None
+        if still is None:
+            raise
+        raise still from error
+
+
 # The payload and the roles of the runs
 
 
@@ -77,12 +120,27 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
 
     Raises:
         PayloadUnseen: every gain is uncertain by more than LARGEST_GAIN_STD, or the weight is below LEAST_WEIGHT.
+        MassesContradict: the first, because the masses of several payloads contradict each other.
     """
     relative, rows = estimate.gains_std / np.abs(estimate.gains), system.joints.factors
     torque = [LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains) for factor in rows]
     weightless = all(np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True))
     if weightless or not float(np.min(relative)) <= LARGEST_GAIN_STD:
+        require_agreeing_masses(system, estimate)
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
+
+
+def require_agreeing_masses(system: System, estimate: Estimate) -> None:
+    """Refuse masses of several payloads that contradict each other.
+
+    Raises:
+        MassesContradict: they do, and that explains more than another payload in a single run.
+    """
+    found = payload_differences(system, estimate.gains, estimate.parameters, 0)
+    masses = likeliest_masses(system, estimate.gains, estimate.parameters, found)
+    if masses is not None:
+        one = masses.diagnosis
+        raise MassesContradict("the payloads", found=one.found, expected=one.expected, remedy=one.remedy)
 
 
 def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:

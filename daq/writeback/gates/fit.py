@@ -26,6 +26,9 @@ NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed", "zero-turned
 BY_ENCODERS = frozenset({"zero-off", "length-off", "place-off", "geometry-off"})
 """Diagnoses by encoders that miss the loops of a closed chain."""
 
+OF_DESCRIPTION = frozenset(CORRECTED_BY) | NEVER_CORRECTED | BY_ENCODERS
+"""Diagnoses that say to correct the description of the robot, and to fit again."""
+
 
 def cell(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a calibration of another cell."""

@@ -21,6 +21,7 @@ from daq.cli.failure import ADVICE, ADVICE_WITHIN, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
 from daq.report.document import ErrorReport, json_tree
 from drivers.canopen.bus import bus_errors
+from drivers.canopen.emcy import remedy_of
 from drivers.errors import BusError, DriveFault, DriverError
 from ident.errors import IdentificationError
 
@@ -42,6 +43,17 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
     failure = ErrorParts.of(error)
     assert all((failure.error, failure.found, failure.expected, failure.do))
     assert all(label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do"))
+
+
+@pytest.mark.parametrize("kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__)
+def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(kind: type[Exception]) -> None:
+    error = kind.__new__(kind)
+    error.args = (f"J3 (node 3): fault; {remedy_of(0x8611)}",)
+    for name in ("subject", "found", "expected", "remedy", "address"):
+        object.__setattr__(error, name, name)
+    failure = ErrorParts.of(error, "demo")
+    assert failure.do
+    assert "CELL" not in f"{failure.error} {failure.found} {failure.do}"
 
 
 @pytest.mark.parametrize("verb", ["scan", "monitor"])

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,6 +27,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.workflow import plan as plan_module
 from daq.workflow.plan import Plan, load_plan, save_plan
+from ident.calibration import AcceptedEffect
 from ident.errors import Diagnosis
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
@@ -201,6 +203,36 @@ def test_other_moves_come_before_a_search_and_a_write_where_a_gain_is_not_seen(
     said = capsys.readouterr().err
     assert said.count("Next: record the moves that CHECK asks for") == 2
     assert "drivegain" not in said
+
+
+ZERO_OFF = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off by +2.00 ± 0.10 °", "that of the URDF", "correct it")
+OTHER_BODY = Diagnosis("payload-differs", ("loaded",), (), "a body", "another", "was it turned?")
+CORRECTED = AcceptedEffect("zero-offset", "J2", {}, (), 6.0, 3.0)
+REFUTED = AcceptedEffect("stribeck", "J2", {}, (), 3.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "printed", "expected"),
+    [
+        ({"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)}, None, "Next: correct the description as CHECK says"),
+        ({"diagnoses": (OTHER_BODY,)}, None, "Next: find the cause of what CHECK says"),
+        ({}, (OTHER_BODY,), "Next: find the cause of what CHECK says"),
+        ({"effects": (REFUTED,)}, None, "`drivegain apply` refuses this calibration: effect stribeck on J2"),
+        ({"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)}, (), "Next: drivegain apply"),
+    ],
+    ids=["a description that the fit corrects", "another body", "of another log", "a gate", "corrected since"],
+)
+def test_nothing_is_written_before_what_is_wrong_is_corrected(
+    cell: Cell,
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, Any],
+    printed: tuple[Diagnosis, ...] | None,
+    expected: str,
+) -> None:
+    say_after_calibration(replace(demo_calibration(), **changed), Path("calibration.yaml"), [], CELL, printed)
+    said = capsys.readouterr().err
+    assert expected in said
+    assert ("Next: drivegain apply" in said) == (expected == "Next: drivegain apply")
 
 
 @pytest.mark.parametrize("simulated", [False, True])

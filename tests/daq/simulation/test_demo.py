@@ -23,6 +23,14 @@ from tests.daq.jobs.rig import BEGAN
 NOTHING_LOST = StreamStatistics(*(0 for _ in StreamStatistics.__slots__))
 
 
+def test_recordings_of_an_earlier_demonstration_are_named_before_they_are_replaced(tmp_path: Path) -> None:
+    logs = (tmp_path / "bare-1.mcap", tmp_path / "loaded-1.mcap")
+    assert demo.make_room(tmp_path, logs) == ()
+    logs[0].touch()
+    assert demo.make_room(tmp_path, logs) == logs[:1]
+    assert not logs[0].exists()
+
+
 @pytest.mark.parametrize("spoilt", range(RETRIES + 2))
 def test_an_invalid_run_is_made_again_and_said_so(
     spoilt: int, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

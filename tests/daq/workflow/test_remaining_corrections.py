@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
-from daq.workflow.validate import on_cell, with_described
+from daq.workflow.validate import not_corrected_since, on_cell, with_described
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.geometry_corrections import corrected_model, turn_between, turned_gravity
+from ident.errors import Diagnosis
 from ident.prediction import corrections_of
 from tests.daq.calibrations import demo_calibration
 
@@ -61,6 +62,29 @@ def test_of_a_zero_the_difference_to_the_cell_is_left(cell: Cell, corrected_rad:
     known = with_described(_calibration(_zero()), cell)
     left, _ = on_cell(known, _with_zero(cell, corrected_rad))
     assert left.effects[0].coefficients[0].value == pytest.approx(ZERO_RAD - corrected_rad, abs=1e-12)
+
+
+ZERO_OFF = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off", "that of the URDF", "correct it")
+OTHER_ZERO = replace(ZERO_OFF, axes=("J3",))
+TILTED = Diagnosis("gravity-tilted", (), (), "gravity turned", "the cell file's", "correct it")
+
+
+@pytest.mark.parametrize(
+    ("corrected_rad", "left"),
+    [(0.0, (ZERO_OFF, OTHER_ZERO)), (0.5 * ZERO_RAD, (ZERO_OFF, OTHER_ZERO)), (ZERO_RAD, (OTHER_ZERO,))],
+)
+def test_a_zero_that_the_cell_file_has_right_since_is_not_named_again(
+    cell: Cell, corrected_rad: float, left: tuple[Diagnosis, ...]
+) -> None:
+    known = replace(with_described(_calibration(_zero()), cell), diagnoses=(ZERO_OFF, OTHER_ZERO))
+    assert not_corrected_since(known, _with_zero(cell, corrected_rad)) == left
+
+
+def test_a_mounting_that_the_cell_file_has_right_since_is_not_named_again(cell: Cell) -> None:
+    known = replace(with_described(_calibration(_gravity()), cell), diagnoses=(TILTED,))
+    assert not_corrected_since(known, cell) == (TILTED,)
+    found = turned_gravity(model_of(cell).robot.gravity_m_s2, TURN_RAD)
+    assert not_corrected_since(known, replace(cell, gravity_m_s2=tuple(found))) == ()
 
 
 def test_of_gravity_the_turn_from_the_cell_is_left(cell: Cell) -> None:

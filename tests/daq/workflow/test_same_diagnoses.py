@@ -149,6 +149,24 @@ def forgotten(run: Run) -> Run:
     return replace(bare, name=run.name, payload=run.payload)
 
 
+def clipped(run: Run) -> Run:
+    """A run in which a limit that nobody reports clips the current of J2."""
+    current = run.current_a.copy()
+    limit = float(np.percentile(np.abs(current[:, 1]), 90.0))
+    current[:, 1] = np.clip(current[:, 1], -limit, limit)
+    return replace(run, current_a=current)
+
+
+def constant(run: Run) -> Run:
+    """A run in which the channel of J2 has one value."""
+    return replace(run, current_a=run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0]))
+
+
+def still(run: Run) -> Run:
+    """A run in which the encoder of J3 has one value."""
+    return replace(run, position_rad=run.position_rad * np.array([1.0, 1.0, 0.0]))
+
+
 #: By mistake: how it is made in the runs r0 to r7, of which r6 and r7 are held out, and what is said of it.
 MISTAKES: dict[str, tuple[Mistake, str]] = {
     "none": (lambda runs: runs, ""),
@@ -168,6 +186,11 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
     "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
+    "J2 clipped": (in_one(3, clipped), "current-clipped r3 J2"),
+    "J2 constant": (in_one(3, constant), "CurrentConstant"),
+    "J3 still": (lambda runs: [still(run) if run.payload else run for run in runs], "JointStill"),
+    "held out: J2 clipped": (in_one(7, clipped), "current-clipped r7 J2"),
+    "held out: J2 constant": (in_one(7, constant), "CurrentConstant"),
     "held out: J2 half as large": (
         in_one(7, lambda run: with_currents([run], np.array([1.0, 0.51, 1.0]))[0]),
         "current-off-scale r7 J2",

@@ -435,6 +435,15 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
 )
 
 
+def test_a_refusal_names_a_wrong_description_that_the_calibration_corrects(scene: Scene) -> None:
+    off = diagnosis_named("zero-off", "J3")
+    wrong = _both(_corrected("zero-offset", off), _calibration(cell="another"))(scene).propose()
+    assert not any(refusal.gate is Gate.DESCRIPTION for refusal in wrong.refusals)
+    assert f"hint: the fit of this calibration found {off.found}; {off.remedy}" in wrong.error.__notes__
+    plain = _calibration(cell="another")(scene).propose()
+    assert not getattr(plain.error, "__notes__", [])
+
+
 def test_a_calibration_that_is_fine_goes_through(scene: Scene) -> None:
     proposal = scene.propose()
     assert proposal.refusals == ()

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import linalg
 
 from ident.data.dataset import Dataset
 from ident.discovery import gates, joining, loop
@@ -229,6 +230,27 @@ def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem
             fitted = np.linalg.lstsq(matrix[~own], problem.residual[~own], rcond=None)[0]
             rise += sign * float(np.sum((problem.residual[own] - matrix[own] @ fitted) ** 2))
     assert PartsLeftOut.of(search_problem).change(columns).total.rise == pytest.approx(rise, rel=1e-4)
+
+
+def test_what_one_run_alone_shows_stays_where_it_is_without_that_run(search_problem: SearchProblem) -> None:
+    """A hose that one run alone stretches has no row in the others: a fit of these does not move it, nor fails."""
+    folds, observation = search_problem.folds, search_problem.observation
+    last_run = observation.run.max()
+    elsewhere = folds.linearisation.of_clusters(observation.run) != last_run
+    hessian = folds.cluster_hessian.copy()
+    score = folds.cluster_score.copy()
+    hessian[elsewhere, -1, :] = 0.0
+    hessian[elsewhere, :, -1] = 0.0
+    score[elsewhere, -1] = 0.0
+    shown_once = replace(search_problem, folds=replace(folds, cluster_hessian=hessian, cluster_score=score))
+
+    others = PartsLeftOut.of(shown_once).others[last_run]
+
+    assert others is not None
+    step = linalg.cho_solve(others.factor, others.score)
+    assert step[-1] == 0.0
+    expected = np.linalg.lstsq(hessian[elsewhere].sum(axis=0)[:-1, :-1], score[elsewhere].sum(axis=0)[:-1], rcond=None)
+    np.testing.assert_allclose(step[:-1], expected[0], rtol=1e-4, atol=1e-6 * np.abs(expected[0]).max())
 
 
 def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:

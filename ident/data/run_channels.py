@@ -1,0 +1,152 @@
+"""Faults of single channels of a run: a joint that never moves, a current that is constant or clipped.
+
+Each is plain in the channel itself. In the equations of a fit it looks like something else, such as a payload that was
+not mounted, so it is named from the channels before a cause is looked for there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray
+from ident.data.dataset import Dataset
+from ident.errors import CurrentConstant, Diagnosis, JointStill
+from ident.model.robot import JointKind
+
+if TYPE_CHECKING:
+    from ident.model.model import Model
+
+STILL_RANGE = {JointKind.REVOLUTE: 1e-3, JointKind.PRISMATIC: 1e-4}
+"""Range below which a joint has not moved, whatever its speed [rad or m]: an encoder's last count may flicker."""
+LEAST_MOVING = 0.01  #: Least share of a run in which a joint that moves is above its standstill speed
+LEAST_SAMPLES = 20  #: Samples of a moving motor that show a constant current
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunChannels:
+    """What each channel of a run shows without any equation."""
+
+    run: str  #: name of the run
+    mounting: str | None  #: of the payload; None without load
+    still: BoolArray  #: joints that never move, shape (m,)
+    range: FloatArray  #: from the smallest to the largest position of each joint [rad or m], shape (m,)
+    constant_current: BoolArray  #: motors that move with a current of one value, shape (m,)
+    clipped_percent: (
+        FloatArray  #: share of the samples of each moving motor in which its current is clipped, shape (m,)
+    )
+    limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
+
+
+def channels_of(model: Model, data: Dataset) -> RunChannels:
+    """Look at the channels of a run.
+
+    Args:
+        model: the declared model.
+        data: a differentiated run.
+    """
+    kinds = [joint.kind for joint in model.robot.axes]
+    least_range = np.array([STILL_RANGE[kind] for kind in kinds])
+    moved = np.ptp(data.position_rad, axis=0)
+    still = (moved <= least_range) | (np.mean(data.moving, axis=0) < LEAST_MOVING)
+    clipped = data.clipped if data.clipped is not None else np.zeros_like(data.valid)
+    usable = data.motor_moving & (data.valid | clipped)
+    percent = 100.0 * np.count_nonzero(clipped, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1)
+    limits = np.max(np.abs(data.current_a), axis=0, where=usable, initial=0.0)
+    is_constant = np.zeros(len(kinds), dtype=np.bool_)
+    for motor in range(len(kinds)):
+        own = data.current_a[usable[:, motor], motor]
+        is_constant[motor] = len(own) >= LEAST_SAMPLES and not still[motor] and np.ptp(own) == 0.0
+    mounting = None if data.payload is None else data.payload.mounting
+    return RunChannels(data.name, mounting, still, moved, is_constant, percent, limits)
+
+
+def require_live_currents(run: RunChannels, axes: Sequence[str]) -> None:
+    """Refuse a run in which a motor moves and its current has one value.
+
+    Raises:
+        CurrentConstant: it has.
+    """
+    dead = np.flatnonzero(run.constant_current).tolist()
+    if dead:
+        raise CurrentConstant(run.run, tuple(axes[axis] for axis in dead), float(run.limits[dead[0]]))
+
+
+def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
+    """Name currents that a limit has clipped; their samples were left out."""
+    for run in runs:
+        for axis in np.flatnonzero(run.clipped_percent > 0.0).tolist():
+            yield _clip_diagnosis(run, axis, axes[axis])
+
+
+def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
+    return Diagnosis(
+        "current-clipped",
+        (run.run,),
+        (name,),
+        f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % of the samples; "
+        "they were left out",
+        "a current that follows the torque at every moment",
+        "record slower moves or with a lighter payload, or raise the limit of the current in the drive or in what "
+        "recorded it",
+    )
+
+
+def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStill | None:
+    """Return the error for a joint that never moves in any run of one mounting, while there are runs of others."""
+    mountings = list(dict.fromkeys(run.mounting for run in runs))
+    if len(mountings) < 2:
+        return None
+    for mounting in mountings:
+        own = [run for run in runs if run.mounting == mounting]
+        still = np.all([run.still for run in own], axis=0)
+        if np.any(still):
+            return JointStill(_names(own), _still_axes(still, axes), _still_text(own, still, axes))
+    return None
+
+
+def still_joint(runs: Sequence[RunChannels], axes: Sequence[str], consequence: str) -> JointStill | None:
+    """Return the error for runs in which a joint never moves, where the fit contradicts itself.
+
+    Args:
+        runs: of the fit.
+        axes: name of each axis.
+        consequence: what the fit shows, in words.
+    """
+    own = [run for run in runs if np.any(run.still)]
+    if not own:
+        return None
+    still = np.any([run.still for run in own], axis=0)
+    found = f"{_still_text(own, still, axes)}, and {consequence}"
+    return JointStill(_names(own), _still_axes(still, axes), found)
+
+
+def still_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> tuple[Diagnosis, ...]:
+    """Name joints that never move in a run."""
+    found: list[Diagnosis] = []
+    for run in runs:
+        if np.any(run.still):
+            error = JointStill(run.run, _still_axes(run.still, axes), _still_text((run,), run.still, axes))
+            names = tuple(_still_axes(run.still, axes))
+            found.append(Diagnosis("joint-still", (run.run,), names, error.found, error.expected, error.remedy))
+    return tuple(found)
+
+
+def _names(runs: Sequence[RunChannels]) -> str:
+    return ", ".join(run.run for run in runs)
+
+
+def _still_axes(still: BoolArray, axes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(axes[axis] for axis in np.flatnonzero(still).tolist())
+
+
+def _still_text(runs: Sequence[RunChannels], still: BoolArray, axes: Sequence[str]) -> str:
+    """Say how still the joints are."""
+    names = " and ".join(_still_axes(still, axes))
+    verb = "never moves" if np.count_nonzero(still) == 1 else "never move"
+    largest = max(float(np.max(run.range[still])) for run in runs)
+    how = "the position is constant" if largest == 0.0 else "no motion is above the standstill speed"
+    return f"{names} {verb}: {how}"
