@@ -33,7 +33,7 @@ class Gain:
     value: float  #: identified gain [unit]
     std: float  #: its standard deviation [unit], 0 where the gain was held fixed
     unit: str  #: Nm at the joint per unit of the current-loop reference
-    nameplate: float  #: the manufacturer's a priori gain [unit]
+    nameplate: float  #: gain by the data sheet [unit]
 
     @property
     def std_percent(self) -> float:
@@ -193,7 +193,7 @@ class Calibration:
     software: str  #: name and version that made it
     #: When the first run of the fit began, by the clock of `Run.started_s`; None where a run has no clock.
     session_began_s: float | None = None
-    #: On the held-out run, of the same model, effects included, fitted with the nameplate's gains; the total weighs the
+    #: On the held-out run, of the same model, effects included, fitted with the nameplate gains; the total weighs the
     #: axes by the torques under the identified gains. None where there is none to compare.
     nameplate_holdout_error_percent: RelativeError | None = None
     #: Digest of the part of the configuration that a recording depends on; None in calibrations of earlier versions.
@@ -259,7 +259,7 @@ def calibration_of(
     Args:
         found: by `ident.identify`; with ``steps``, the one that they began with.
         axes: name of each axis.
-        nameplate: the manufacturer's gains, one an axis.
+        nameplate: gains by the data sheet, one an axis.
         units: of each gain; Nm/A where it is left out.
         robot: name of the robot or cell.
         steps: by `ident.find_effects`: the calibration is that of the last one, with the effects that it holds.

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
+from statistics import fmean
 from typing import Literal
 
 from daq.documents.calibration_file import encode_calibration
@@ -27,7 +28,7 @@ from daq.report.text import minute_text
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import GainChange, GainOrigin
-from ident.calibration import Calibration, EncoderMisfit, PayloadMass
+from ident.calibration import Calibration, EncoderMisfit, PayloadMass, Source
 from ident.data.run import Recording
 
 
@@ -143,6 +144,9 @@ class CertificateReport(Report):
     effects: list[CertifiedEffect]
     beside: EarlierCalibration | None
 
+
+FIT_ROLE = "fit"  #: Of a source
+BALANCED_PLACES = 0.5  #: Between the mean places of bare and of loaded runs in their order
 
 _ID_DIGITS = 12  #: As history and audit log shorten a digest
 
@@ -503,10 +507,42 @@ def identity(calibration: Calibration) -> dict[str, str]:
         "Payload": payloads or "none: every run was recorded without load",
         "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
     }
+    order = order_text(calibration.sources)
+    if order:
+        names["Order of runs"] = order
     if calibration.encoder_misfit is not None:
         names["Encoders"] = encoder_text(calibration.encoder_misfit)
     names["Fitted"] = f"{minute_text(calibration.created)}, {calibration.software or 'software not known'}"
     return names
+
+
+def order_text(sources: Sequence[Source]) -> str:
+    """In which order bare and loaded runs of the fit were recorded, and what that does to slow changes.
+
+    Empty where a time is not known, or all runs are of one kind. The means of their places in the order are compared:
+    friction that changes evenly from run to run is the same for both kinds where these are equal.
+
+    Args:
+        sources: of the calibration.
+    """
+    timed: list[tuple[float, bool]] = []
+    for source in sources:
+        if source.role != FIT_ROLE:
+            continue
+        if source.recording is None or source.recording.recorded_s is None:
+            return ""
+        timed.append((source.recording.recorded_s, source.payload is not None))
+    is_loaded = [loaded for _, loaded in sorted(timed)]
+    loaded_places = [place for place, loaded in enumerate(is_loaded) if loaded]
+    bare_places = [place for place, loaded in enumerate(is_loaded) if not loaded]
+    if not loaded_places or not bare_places:
+        return ""
+    listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
+    later = fmean(loaded_places) - fmean(bare_places)
+    if abs(later) <= BALANCED_PLACES:
+        return f"{listed}: what changes evenly while the arm warms up is the same in both, and moves no gain"
+    last = "loaded" if later > 0.0 else "bare"
+    return f"{listed}: {last} runs come later, so friction that falls while the arm warms up moves the gains"
 
 
 def payload_texts(calibration: Calibration) -> Iterator[str]:

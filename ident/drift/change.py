@@ -67,14 +67,14 @@ _COMMON_SIGMAS = 4.0
 class Change:
     """Change of one gain."""
 
-    percent: float  #: of the old value's magnitude [%], inf from zero; negative where the gain has decreased
+    percent: float  #: of the compared gain's magnitude [%], inf from zero; negative where the gain has decreased
     sigmas: float  #: the change over its σ, signed as `percent`
     probability: float  #: of so large a change by noise alone, two-sided
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeDecision:
-    """Whether a recalibration differs from the gains in force."""
+    """Whether a recalibration differs from the current gains."""
 
     differs: bool  #: at least one gain has changed by more than noise
     axes: tuple[str, ...]  #: names, as they were given

@@ -79,7 +79,7 @@ def diagnose(
     Args:
         found: with or without effects; of any estimator.
         axes: name of each axis.
-        nameplate: the manufacturer's gains, shape (m,); without them no gain is compared.
+        nameplate: gains by the data sheet, shape (m,); without them no gain is compared.
         effort_limit: of the joints, inf where unknown [Nm or N], shape (m,).
 
     Raises:
@@ -204,11 +204,12 @@ def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str
             "together with these; do not use this gain",
         )
     for axis in np.flatnonzero(is_off).tolist():
+        gain = f"{estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}"
         yield Diagnosis(
             "gain-off-nameplate",
             (),
             (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, {ratio[axis]:.3g} nameplates",
+            f"a gain of {gain}, {ratio[axis]:.3g} times the nameplate",
             f"{range_text(GAIN_RANGE)} of {nameplate[axis]:.4g}, within {GAIN_SIGMAS:g} σ",
             "is the nameplate of this axis, its gear ratio, the scale of its current or the payload's mass wrong?",
         )

@@ -61,7 +61,7 @@ def refuse_mistakes(
         system: of the fit.
         estimate: of these equations, by `judged_estimate`.
         axes: name of each axis.
-        nameplate: the manufacturer's gains, shape (m,); None where they are not known.
+        nameplate: gains by the data sheet, shape (m,); None where they are not known.
 
     Raises:
         PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: the first that applies.

@@ -738,7 +738,7 @@ class MotorFit:
 
 
 def first_fit(model: Model, products: Products, reference: FloatArray) -> MotorFit:
-    """Begin a fit with the nameplate's gains, and the signs with which each motor's friction brakes.
+    """Begin a fit with the nameplate gains, and the signs with which each motor's friction brakes.
 
     Args:
         model, products: of the hypothesis.

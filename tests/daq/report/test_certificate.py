@@ -22,7 +22,7 @@ from daq.files import sha256
 from daq.jobs.session import Session, save, session_of
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import record_session
-from daq.report.certificate import Certificate, Origin, Verdict, certificate_report, certify
+from daq.report.certificate import Certificate, Origin, Verdict, certificate_report, certify, order_text
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import compare, without_controller
 from daq.report.document import json_tree
@@ -30,12 +30,20 @@ from daq.report.effect_names import curve_of, named_size, size_text
 from daq.report.gains import with_deviation
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
-from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass
+from ident.calibration import AcceptedEffect, Calibration, Parameter, PayloadMass, Source
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
-from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, RECORDED, calibration_for, demo_calibration, with_recordings
+from tests.daq.calibrations import (
+    IDENTIFIED,
+    NAMEPLATE,
+    RECORDED,
+    calibration_for,
+    demo_calibration,
+    demo_recording,
+    with_recordings,
+)
 
 NOW = RECORDED + timedelta(hours=1)
 HOSTILE = '<script>alert("x")</script>&<img src=http://example.org/x>'
@@ -397,6 +405,38 @@ def test_a_written_calibration_that_a_check_would_refuse_today_says_both(cell_fi
     assert ". Today a check refuses them: J1: σ 0.40 %, expected at most 0.1 % (and 5 more, below)." in (
         certificate.sentence
     )
+
+
+def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
+    """Runs of the fit, `b` without load and `l` with it, given to it in another order than they were recorded in."""
+    sources: list[Source] = []
+    for place, kind in enumerate(payloads):
+        recording = replace(demo_recording(), recorded_s=1.7e9 + 60.0 * place)
+        payload = "disc" if kind == "l" else None
+        sources.append(Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording))
+    return tuple(reversed(sources))
+
+
+@pytest.mark.parametrize(
+    ("payloads", "said"),
+    [
+        ("bllb", "bare, loaded, loaded, bare: what changes evenly while the arm warms up is the same in both"),
+        ("bllbbl", "bare, loaded, loaded, bare, bare, loaded: what changes evenly"),
+        ("bl", "bare, loaded: loaded runs come later, so friction that falls while the arm warms up moves the gains"),
+        ("llb", "loaded, loaded, bare: bare runs come later"),
+        ("bb", ""),
+    ],
+)
+def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str, said: str) -> None:
+    text = order_text(_recorded_in_order(payloads))
+    assert text.startswith(said)
+    assert bool(text) == bool(said)
+
+
+def test_an_order_that_no_clock_tells_is_not_said() -> None:
+    first, *others = _recorded_in_order("bllb")
+    unknown = replace(first, recording=None)
+    assert order_text((unknown, *others)) == ""
 
 
 def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:

@@ -352,7 +352,7 @@ def test_a_current_in_another_ampere_is_named(small_truth: Truth, clean: list[Ru
     """A torque constant that is applied twice, or an ampere that is a peak value of two."""
     (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, factor, 1.0])))
     assert (found.name, found.axes) == ("gain-off-nameplate", ("J2",))
-    ratio = re.search(r"([0-9.]+) nameplates$", found.found)
+    ratio = re.search(r"([0-9.]+) times the nameplate$", found.found)
     assert ratio is not None
     assert float(ratio[1]) == pytest.approx(1.0 / factor, rel=0.05)
 
