@@ -116,5 +116,5 @@ def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident
 
 def test_several_runs_are_named_one_by_one(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
     still = [replace(run, position_rad=run.position_rad * [1.0, 0.0, 1.0]) for run in short]
-    with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: q1 never moves"):
+    with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: axis q1: found q1 never moves"):
         ident.identify(small_truth.model, still, ident.Conditioning())
