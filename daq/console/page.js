@@ -486,11 +486,12 @@ function duration(seconds) {
 function quickText(look) {
   if (look.missing) return `No gains yet: ${look.missing}.`;
   const listed = look.gains.map((gain) =>
-    `${gain.axis} ${Number(gain.value.toPrecision(4))} ${gain.unit} ± ${number(gain.std_percent, 2)} % (${gain.target_percent} %)`);
-  if (look.is_held_out) return `This block is held out: its moves do not count. Quick estimate so far, gain ± σ (target): ${listed.join(", ")}.`;
-  const head = `Quick estimate after move ${look.move} of ${look.moves}, gain ± σ (target): ${listed.join(", ")}.`;
-  if (look.left_s <= 0) return `${head} All are at the target; the estimate at the end of the block decides.`;
-  return `${head} ${look.gains[0].axis} is worst (${look.why}): about ${duration(look.left_s)} left at this rate.`;
+    `${gain.axis} ${Number(gain.value.toPrecision(4))} ± ${number(gain.std_percent, 2)} %`);
+  const besideTarget = `target ± ${look.gains[0].target_percent} %: ${listed.join(", ")}.`;
+  if (look.is_held_out) return `This block is held out, its moves do not count. Quick estimate so far, ${besideTarget}`;
+  const head = `Quick estimate after move ${look.move} of ${look.moves}, ${besideTarget}`;
+  if (look.left_s <= 0) return `${head} All at the target so far; the end of the block decides.`;
+  return `${head} ${look.gains[0].axis} is worst (${look.why}): about ${duration(look.left_s)} left.`;
 }
 
 function takeLook(look) {

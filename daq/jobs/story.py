@@ -85,20 +85,15 @@ def _quick(fields: Fields) -> str:
     if fields["missing"]:
         return f"No gains yet: {fields['missing']}."
     gains = fields["gains"]
-    listed = ", ".join(_beside_target(gain) for gain in gains)
+    listed = ", ".join(f"{gain['axis']} {gain['value']:.4g} ± {gain['std_percent']:.2f} %" for gain in gains)
+    beside_target = f"target ± {gains[0]['target_percent']:g} %: {listed}."
     if fields["is_held_out"]:
-        return f"This block is held out: its moves do not count. Quick estimate so far, gain ± σ (target): {listed}."
-    head = f"Quick estimate after move {fields['move']} of {fields['moves']}, gain ± σ (target): {listed}."
+        return f"This block is held out, its moves do not count. Quick estimate so far, {beside_target}"
+    head = f"Quick estimate after move {fields['move']} of {fields['moves']}, {beside_target}"
     left_s = fields["left_s"]
     if left_s <= 0.0:
-        return f"{head} All are at the target; the estimate at the end of the block decides."
-    return f"{head} {gains[0]['axis']} is worst ({fields['why']}): about {duration(left_s)} left at this rate."
-
-
-def _beside_target(gain: Fields) -> str:
-    """Return a gain ± σ with its target in brackets."""
-    value = f"{gain['axis']} {gain['value']:.4g} {gain['unit']}"
-    return f"{value} ± {gain['std_percent']:.2f} % ({gain['target_percent']:g} %)"
+        return f"{head} All at the target so far; the end of the block decides."
+    return f"{head} {gains[0]['axis']} is worst ({fields['why']}): about {duration(left_s)} left."
 
 
 def _time_is_up(fields: Fields) -> str:
