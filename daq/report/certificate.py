@@ -540,9 +540,9 @@ def order_text(sources: Sequence[Source]) -> str:
     listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
     later = fmean(loaded_places) - fmean(bare_places)
     if abs(later) <= BALANCED_PLACES:
-        return f"{listed}: what changes evenly while the arm warms up is the same in both, and moves no gain"
+        return f"{listed}; so an even warm-up moves no gain"
     last = "loaded" if later > 0.0 else "bare"
-    return f"{listed}: {last} runs come later, so friction that falls while the arm warms up moves the gains"
+    return f"{listed}; {last} runs come later, so a warm-up moves the gains"
 
 
 def payload_texts(calibration: Calibration) -> Iterator[str]:

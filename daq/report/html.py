@@ -122,11 +122,11 @@ summary:focus-visible { outline: 3px solid var(--data); }
   .words td:not(:last-child)::before { content: attr(data-name); display: block; color: var(--soft);
     font-size: 0.9rem; }
 }
-@page { margin: 11mm; }
+@page { margin: 10mm; }
 @media print {
   html { font-size: 8.5pt; }
-  body { margin: 0; padding: 0; max-width: none; font-size: 8.5pt; line-height: 1.3; }
-  h1 { font-size: 14pt; margin: 0 0 1mm; } h2 { font-size: 10pt; margin: 2.5mm 0 1mm; }
+  body { margin: 0; padding: 0; max-width: none; font-size: 8.5pt; line-height: 1.27; }
+  h1 { font-size: 14pt; margin: 0 0 1mm; } h2 { font-size: 10pt; margin: 2mm 0 0.8mm; }
   h3 { font-size: 8.5pt; margin: 1.5mm 0 0.5mm; } p, ul { margin: 0.8mm 0; } dl { margin: 1.5mm 0; }
   .verdict { font-size: 10pt; margin: 1.5mm 0 0; padding: 1.2mm 2mm; } .next { padding: 0 2mm 1.2mm; }
   .screen { display: none; } .paper { display: block; }
@@ -139,7 +139,7 @@ summary:focus-visible { outline: 3px solid var(--data); }
   .pair table { font-size: 7pt; }
   .paper dl { font-size: 7pt; line-height: 1.25; gap: 0 3mm; margin: 0; }
   .paper dd { font-family: ui-monospace, monospace; }
-  .sign { display: flex; gap: 8mm; margin-top: 11mm; break-inside: avoid; }
+  .sign { display: flex; gap: 8mm; margin-top: 9mm; break-inside: avoid; }
   .sign span { flex: 1; border-top: 0.5pt solid var(--ink); padding-top: 0.5mm; color: var(--soft); }
   figure, table, dl, .verdict { break-inside: avoid; } h2, h3 { break-after: avoid; } .next { break-before: avoid; }
   .details { break-before: page; }

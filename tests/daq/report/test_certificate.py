@@ -420,17 +420,16 @@ def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
 @pytest.mark.parametrize(
     ("payloads", "said"),
     [
-        ("bllb", "bare, loaded, loaded, bare: what changes evenly while the arm warms up is the same in both"),
-        ("bllbbl", "bare, loaded, loaded, bare, bare, loaded: what changes evenly"),
-        ("bl", "bare, loaded: loaded runs come later, so friction that falls while the arm warms up moves the gains"),
-        ("llb", "loaded, loaded, bare: bare runs come later"),
+        ("bllb", "bare, loaded, loaded, bare; so an even warm-up moves no gain"),
+        ("bllbbl", "bare, loaded, loaded, bare, bare, loaded; so an even warm-up moves no gain"),
+        ("bl", "bare, loaded; loaded runs come later, so a warm-up moves the gains"),
+        ("llb", "loaded, loaded, bare; bare runs come later, so a warm-up moves the gains"),
         ("bb", ""),
     ],
 )
 def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str, said: str) -> None:
     text = order_text(_recorded_in_order(payloads))
-    assert text.startswith(said)
-    assert bool(text) == bool(said)
+    assert text == said
 
 
 def test_an_order_that_no_clock_tells_is_not_said() -> None:
