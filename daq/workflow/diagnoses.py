@@ -325,7 +325,7 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | 
     given = evidence.uncorrected or evidence
     found: list[Diagnosis] = []
     for placed in evidence.effects[evidence.declared :]:
-        if type(placed.effect) in CORRECTED_BY:
+        if type(placed.effect) in DIAGNOSED_AS:
             values, deviations = coefficients_of(evidence.estimate, placed)
             diagnosis = _correction_diagnosis(placed, values, deviations, cell, given.model)
             if check is not None:
@@ -334,7 +334,9 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | 
     return tuple(found)
 
 
-def open_correction_diagnoses(steps: Sequence[Step], cell: Cell) -> tuple[Diagnosis, ...]:
+def open_correction_diagnoses(
+    steps: Sequence[Step], cell: Cell, check: GeometryCheck | None = None
+) -> tuple[Diagnosis, ...]:
     """Diagnoses of corrections that a search has found and that are not in its model, although nothing refutes them.
 
     Held-out runs have left them undecided, or the search has set them aside. The description may be wrong by them, and
@@ -343,6 +345,7 @@ def open_correction_diagnoses(steps: Sequence[Step], cell: Cell) -> tuple[Diagno
     Args:
         steps: of the search, with the verdicts of held-out runs.
         cell: whose description it is.
+        check: beside the fit; None where nothing was tested.
     """
     if not steps:
         return ()
@@ -355,7 +358,7 @@ def open_correction_diagnoses(steps: Sequence[Step], cell: Cell) -> tuple[Diagno
         if is_undecided and is_correction(placed):
             values, deviations = _values_in_search(steps, placed)
             why = f"held-out runs do not decide it: {verdict.reason}"
-            found.append(_open_correction(placed, values, deviations, why, cell, model))
+            found.append(_open_correction(placed, values, deviations, why, cell, model, check))
     for aside in last.set_aside:
         finding = aside.finding
         placed = PlacedEffect(finding.effect, finding.axis)
@@ -363,7 +366,7 @@ def open_correction_diagnoses(steps: Sequence[Step], cell: Cell) -> tuple[Diagno
         is_known = placed in last.after.effects or placed in last.left_open
         if is_correction(placed) and not is_known:
             why = aside.reason(cell.place_names)
-            found.append(_open_correction(placed, finding.coefficients, finding.deviations, why, cell, model))
+            found.append(_open_correction(placed, finding.coefficients, finding.deviations, why, cell, model, check))
     return tuple(found)
 
 
@@ -380,10 +383,18 @@ def _values_in_search(steps: Sequence[Step], placed: PlacedEffect) -> tuple[Floa
 
 
 def _open_correction(
-    placed: PlacedEffect, values: FloatArray, deviations: FloatArray, why: str, cell: Cell, model: Model
+    placed: PlacedEffect,
+    values: FloatArray,
+    deviations: FloatArray,
+    why: str,
+    cell: Cell,
+    model: Model,
+    check: GeometryCheck | None,
 ) -> Diagnosis:
     """Diagnosis of a correction that is not in the model, with the reason why it is not."""
     diagnosis = _correction_diagnosis(placed, values, deviations, cell, model)
+    if check is not None:
+        diagnosis = _beside_alike(diagnosis, placed, check, cell, model)
     return replace(diagnosis, found=f"{diagnosis.found}; the gains are without this correction ({why})")
 
 
@@ -405,23 +416,25 @@ def _beside_alike(
         cell: whose description it is.
         model: as declared.
     """
-    places = [PlacedEffect(one.effect, one.axis) for one in check.alike]
-    if placed not in places:
+    other_findings = [one for one in check.alike if PlacedEffect(one.effect, one.axis) != placed]
+    if len(other_findings) == len(check.alike):  # it is not among them
         return diagnosis
-    others = [
-        _finding_diagnosis(one, cell, model) for one, place in zip(check.alike, places, strict=True) if place != placed
-    ]
-    expected = dict.fromkeys((diagnosis.expected, *(one.expected for one in others)))
-    axes = dict.fromkeys((*diagnosis.axes, *(axis for one in others for axis in one.axes)))
+    named = (diagnosis, *(_finding_diagnosis(one, cell, model) for one in other_findings))
+    found = " or ".join(one.found for one in named)
+    expected = dict.fromkeys(one.expected for one in named)
+    axes: dict[str, None] = {}
+    for one in named:
+        axes |= dict.fromkeys(one.axes)
     wanted = "moves at other speeds and in other poses"
     if check.axes_to_move:
         names = " and ".join(cell.place_names[axis] for axis in check.axes_to_move)
-        wanted = f"moves in which {names} turn{'s' if len(check.axes_to_move) == 1 else ''} further"
+        verb = "turns" if len(check.axes_to_move) == 1 else "turn"
+        wanted = f"moves in which {names} {verb} further"
     return replace(
         diagnosis,
         name=CORRECTION_UNCLEAR,
         axes=tuple(axes),
-        found=f"either {' or '.join(one.found for one in (diagnosis, *others))}: these moves do not tell them apart",
+        found=f"either {found}: these moves do not tell them apart",
         expected=" and ".join(expected),
         remedy=f"record {wanted}, and fit them together with these; or measure which of them is wrong; correct nothing "
         "in the cell file before that",
@@ -458,7 +471,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
 
 
 ONE_MOMENT = "positions and currents of one moment"  #: Expected of the positions of every axis
-CORRECTED_BY: dict[type[Effect], str] = {
+DIAGNOSED_AS: dict[type[Effect], str] = {
     ZeroOffset: "zero-off",
     LatePosition: "position-late",
     GravityDirection: "gravity-tilted",
@@ -477,7 +490,7 @@ def _diagnosis_of(
 ) -> Diagnosis:
     """Diagnosis of a wrong description, by the correction that it needs."""
     axes = (name,) if placed.effect.has_axis else ()
-    return Diagnosis(CORRECTED_BY[type(placed.effect)], tuple(runs), axes, found, expected, remedy)
+    return Diagnosis(DIAGNOSED_AS[type(placed.effect)], tuple(runs), axes, found, expected, remedy)
 
 
 def _correction_diagnosis(

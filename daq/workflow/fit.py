@@ -392,7 +392,11 @@ def _with_description_after_search(closed: Fit) -> Fit:
     if len(after.effects) == after.declared:  # the model is the one beside which it was named
         return closed
     beside = geometry_beside(after, BOOTSTRAP_SEED)
-    return replace(closed, description=replace(description, mistake=None if beside is None else beside.mistake))
+    if beside is None:
+        return replace(closed, description=replace(description, mistake=None))
+    # Gravity and hidden zeros stay those of the fit; the mistake and its company are those of the final model.
+    kept = replace(beside, gravity=description.gravity, hidden_zeros=description.hidden_zeros)
+    return replace(closed, description=kept)
 
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
@@ -404,7 +408,7 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     has_searched = any(not step.declared for step in fitted.steps)
     if has_searched:
         found += correction_diagnoses(fitted.steps[-1].after, fitted.cell, fitted.description)
-        found += open_correction_diagnoses(fitted.steps, fitted.cell)
+        found += open_correction_diagnoses(fitted.steps, fitted.cell, fitted.description)
     if fitted.description is not None:
         found += check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
     first: dict[tuple[str, tuple[str, ...]], Diagnosis] = {}

@@ -19,7 +19,7 @@ from daq.config.cell import Cell, model_of
 from daq.config.same_cell import mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.diagnoses import CORRECTED_BY, drift_diagnosis, with_verbs
+from daq.workflow.diagnoses import DIAGNOSED_AS, drift_diagnosis, with_verbs
 from daq.workflow.geometry_diagnoses import calibrated_model
 from ident.arrays import BoolArray, FloatArray
 from ident.calibration import AcceptedEffect, Calibration
@@ -650,7 +650,7 @@ def not_corrected_since(calibration: Calibration, cell: Cell) -> tuple[Diagnosis
         left = _remaining(accepted, calibration, cell)
         if all(abs(one.value) <= SAME_SIGMAS * one.std for one in left.coefficients):
             axis = accepted.axis if placed.effect.has_axis else None
-            corrected.add((CORRECTED_BY[type(placed.effect)], axis))
+            corrected.add((DIAGNOSED_AS[type(placed.effect)], axis))
     return tuple(one for one in calibration.diagnoses if (one.name, next(iter(one.axes), None)) not in corrected)
 
 

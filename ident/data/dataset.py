@@ -47,7 +47,8 @@ class Dataset:
     demanded: Motion | None = None
     #: Temperature of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
-    #: Samples whose current a limit has clipped, unreported; they are not valid. None where nobody looked.
+    #: Samples whose current was clipped by a limit that the drive does not report; they are not valid. None where
+    #: clipping was not looked for.
     clipped: BoolArray | None = None
     is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 

@@ -35,9 +35,8 @@ class RunChannels:
     still: BoolArray  #: joints that never move, shape (m,)
     range: FloatArray  #: from the smallest to the largest position of each joint [rad or m], shape (m,)
     constant_current: BoolArray  #: motors that move with a current of one value, shape (m,)
-    clipped_percent: (
-        FloatArray  #: share of the samples of each moving motor in which its current is clipped, shape (m,)
-    )
+    #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
+    clipped_percent: FloatArray
     limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
 
 
@@ -129,8 +128,8 @@ def still_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> tuple[D
     found: list[Diagnosis] = []
     for run in runs:
         if np.any(run.still):
-            error = JointStill(run.run, _still_axes(run.still, axes), _still_text((run,), run.still, axes))
-            names = tuple(_still_axes(run.still, axes))
+            names = _still_axes(run.still, axes)
+            error = JointStill(run.run, names, _still_text((run,), run.still, axes))
             found.append(Diagnosis("joint-still", (run.run,), names, error.found, error.expected, error.remedy))
     return tuple(found)
 

@@ -22,21 +22,20 @@ OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain be
 WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behind it enough
 
 
-def explains_beside(problem: SearchProblem, correction: Finding, rival: Finding) -> bool:
-    """Whether a correction explains most of what it does beside another effect, too.
+def explains_beside(problem: SearchProblem, torque_nm: FloatArray, held_out_fall: float, rival_nm: FloatArray) -> bool:
+    """Whether a mistake explains most of what it does beside another effect, too.
 
     Args:
-        problem: with rows that serve as signals.
-        correction: of the description.
-        rival: the other effect.
+        problem: around the fit.
+        torque_nm: columns of the mistake at the joints, shape (m, p, r).
+        held_out_fall: of ‖e‖² on held-out moves, by the mistake alone.
+        rival_nm: columns of the other effect.
     """
-    of_rival = problem.torque_at_rows(rival.effect, rival.axis)
-    of_correction = problem.torque_at_rows(correction.effect, correction.axis)
-    alone, both = problem.trials([of_rival, np.concatenate((of_rival, of_correction), axis=1)])
+    alone, both = problem.trials([rival_nm, np.concatenate((rival_nm, torque_nm), axis=1)])
     if alone is None or both is None:
         return False
     fall = float(alone.held_out.sum() - both.held_out.sum())
-    return fall >= OWN_SHARE * correction.held_out_fall
+    return fall >= OWN_SHARE * held_out_fall
 
 
 def alike_corrections(problem: SearchProblem, correction: Finding, findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -47,11 +46,13 @@ def alike_corrections(problem: SearchProblem, correction: Finding, findings: Seq
         correction: that was found.
         findings: of all corrections of the description.
     """
+    torque_nm = problem.torque_at_rows(correction.effect, correction.axis)
     alike: list[Finding] = []
     for other in findings:
         if PlacedEffect(other.effect, other.axis) not in correction.ambiguity or other.impossible:
             continue
-        if not explains_beside(problem, correction, other):
+        of_other_nm = problem.torque_at_rows(other.effect, other.axis)
+        if not explains_beside(problem, torque_nm, correction.held_out_fall, of_other_nm):
             alike.append(other)
     return tuple(alike)
 

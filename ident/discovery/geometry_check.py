@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.alike_corrections import OWN_SHARE, alike_corrections, axes_to_move
+from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
@@ -96,6 +96,10 @@ class _Suspect:
         """Whether currents are late."""
         return isinstance(self.effects[0].effect, (Lag, TimeSkew))
 
+    def explains_beside(self, problem: SearchProblem, rival_nm: FloatArray) -> bool:
+        """Whether it explains most of what it does beside a rival, too."""
+        return explains_beside(problem, self.torque_nm, self.held_out_fall, rival_nm)
+
 
 @dataclass(frozen=True, slots=True)
 class _Rivals:
@@ -173,16 +177,19 @@ def _alike(
         return ()
     mistake = mistakes[0]
     corrections = [found for found in findings if isinstance(found.effect, GeometryEffect)]
-    # Among corrections alone: what the moves do not tell apart from a mistake is told by its place among these.
+    # As it was ranked among the corrections: its ambiguity names those that folds do not distinguish from it.
     (as_found,) = (one for one in corrections if (one.effect.name, one.axis) == (mistake.effect.name, mistake.axis))
     others = alike_corrections(problem, as_found, corrections)
+    if not others:
+        return ()
     alike = [mistake]
     for other in others:
         placed = PlacedEffect(other.effect, other.axis)
         torque_nm = problem.torque_at_rows(other.effect, other.axis)
-        settled = _settled(evidence, _Suspect((placed,), torque_nm, other.coefficients, other.held_out_fall), (other,))
+        suspect = _Suspect((placed,), torque_nm, other.coefficients, other.held_out_fall)
+        settled = _settled(evidence, suspect, (other,))
         alike.append(settled[0] if settled else other)
-    return tuple(alike) if others else ()
+    return tuple(alike)
 
 
 def _suspects(
@@ -247,7 +254,7 @@ def _mistakes(
         if not any(found.passed for found in own):
             continue
         best = suspects[0]
-        if suspect is not best and not _explains_beside(problem, suspect, best.torque_nm):
+        if suspect is not best and not suspect.explains_beside(problem, best.torque_nm):
             continue
         if not _stands_beside(problem, suspect, own, rivals):
             continue
@@ -272,7 +279,7 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     others = rivals.others(suspect)
     best = others[0]
     is_best = suspect.held_out_fall >= best.held_out_fall
-    if not is_best and not _explains_beside(problem, suspect, rivals.torque_nm(problem, best)):
+    if not is_best and not suspect.explains_beside(problem, rivals.torque_nm(problem, best)):
         return False
     if not suspect.is_of_currents:
         return True
@@ -280,7 +287,7 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
         of_axis = [other for other in others if _is_of_axis(other, found)]
         if of_axis and of_axis[0].held_out_fall > found.held_out_fall:
             alone = replace(suspect, torque_nm=suspect.torque_nm[:, [index]], held_out_fall=found.held_out_fall)
-            if not _explains_beside(problem, alone, rivals.torque_nm(problem, of_axis[0])):
+            if not alone.explains_beside(problem, rivals.torque_nm(problem, of_axis[0])):
                 return False
     return True
 
@@ -289,15 +296,6 @@ def _is_of_axis(other: Finding, found: Finding) -> bool:
     """Whether a finding is an effect of the axis of another one, and corrects nothing of the whole arm."""
     is_same = found.effect.has_axis and other.axis == found.axis
     return is_same and not isinstance(other.effect, GeometryEffect)
-
-
-def _explains_beside(problem: SearchProblem, suspect: _Suspect, rival_nm: FloatArray) -> bool:
-    """Whether a suspect explains most of what it does beside a rival, too."""
-    alone, both = problem.trials([rival_nm, np.concatenate((rival_nm, suspect.torque_nm), axis=1)])
-    if alone is None or both is None:
-        return False
-    fall = float(alone.held_out.sum() - both.held_out.sum())
-    return fall >= OWN_SHARE * suspect.held_out_fall
 
 
 def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -323,18 +321,21 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> t
     shown: list[Finding] = []
     for found, placed in zip(own, corrected.effects[-len(own) :], strict=True):
         values, deviations = coefficients_of(estimate, placed)
+        covariance = _covariance_of(estimate, placed)
+        settled = replace(found, effect=placed.effect, coefficients=values, deviations=deviations)
         if np.any(deviations < LEAST_SETTLED_STD * found.deviations):
-            shown.append(found)
+            # The fit has lost the correction in a parameter of the corrected robot: the linear values stay.
+            settled = found
+            covariance = np.diag(found.deviations**2)
+        if impossible(settled.effect.coefficients, settled.coefficients, settled.deviations):
             continue
-        if impossible(placed.effect.coefficients, values, deviations):
+        if suspect.is_of_currents and abs(float(settled.coefficients[0])) < LEAST_DELAY_S:
             continue
-        if suspect.is_of_currents and abs(float(values[0])) < LEAST_DELAY_S:
-            continue
-        if in_noise(values, _covariance_of(estimate, placed), SHOWN):
+        if in_noise(settled.coefficients, covariance, SHOWN):
             continue
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
-        shown.append(replace(found, effect=placed.effect, coefficients=values, deviations=deviations))
+        shown.append(settled)
     return tuple(shown)
 
 

@@ -11,8 +11,8 @@ explanation where it leaves
 
 The second is absolute. Arms that bend leave a misfit that depends on the pose, and so does every zero and length: some
 three of them always take most of it, but not down to the noise. The explanation with the fewest numbers is taken, one
-before two before three. Numbers that are not in it stay as they are described. More than three wrong numbers are not
-told from a cause that is no number at all, and nothing is corrected then.
+before two before three. Numbers that are not in it stay as they are described. More than three wrong numbers
+look like another cause, such as arms that bend, and then nothing is corrected.
 
 Positions are used as they were recorded: a low-pass bends a closed loop, and the encoders' noise is that of their
 counts. Its correlation is estimated (`ident.estimators.encoder_noise`), and all rows are made white by it.

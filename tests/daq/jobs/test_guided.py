@@ -324,7 +324,7 @@ def test_a_certificate_that_cannot_be_written_again_is_a_warning_with_what_to_do
 
 
 def test_a_result_that_is_no_number_accepts_nothing(tmp_path: Path, made_session: MadeSession) -> None:
-    """Of an axis that did not move in the acceptance run."""
+    """An axis that did not move in the acceptance run has no scale."""
     rig = made_session_rig(tmp_path / "cell", made_session)
     moved = made_session.after.use.copy()
     moved[-1] = False

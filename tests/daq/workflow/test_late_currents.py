@@ -16,6 +16,7 @@ from ident.discovery.search import Finding
 from ident.effects.effect import Effect
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.geometry_corrections import LatePosition
+from tests.ident.findings import passed_finding
 from tests.ident.recordings import gantry_truth
 
 
@@ -25,21 +26,7 @@ def cell() -> Cell:
 
 
 def _finding(effect: Effect, axis: int, seconds: float) -> Finding:
-    return Finding(
-        effect=effect,
-        axis=axis,
-        coefficients=np.array([seconds]),
-        deviations=np.array([7e-5]),
-        probability=0.001,
-        folds_better=1.0,
-        explained=0.3,
-        error_before_percent=2.0,
-        error_after_percent=1.0,
-        error_fall=0.5,
-        held_out_fall=100.0,
-        passed=True,
-        fold_errors=np.ones(8),
-    )
+    return passed_finding(effect, axis, seconds, 7e-5)
 
 
 def _checked(*found: Finding) -> GeometryCheck:

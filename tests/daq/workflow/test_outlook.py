@@ -64,7 +64,7 @@ def accepted(experiment: Experiment) -> tuple[Plan, ...]:
 
 @pytest.fixture(scope="module")
 def room(experiment: Experiment, accepted: tuple[Plan, ...]) -> AcceptedRoom:
-    """Of these moves."""
+    """The room of the accepted moves."""
     return accepted_room(experiment.cell, experiment.scene, accepted)
 
 

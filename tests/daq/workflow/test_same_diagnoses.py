@@ -35,14 +35,14 @@ from ident.discovery.effect_verdict import Judgement
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step, find_effects
-from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry_corrections import ZeroOffset
+from ident.effects.geometry_corrections import LatePosition, ZeroOffset
 from ident.errors import Diagnosis, IdentificationError
 from ident.estimators.turned_geometry import with_gravity
 from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
+from tests.ident.findings import passed_finding
 from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, record, three_axes_truth
 
@@ -150,7 +150,7 @@ def forgotten(run: Run) -> Run:
 
 
 def clipped(run: Run) -> Run:
-    """A run in which a limit that nobody reports clips the current of J2."""
+    """A run in which a limit clips the current of J2, and the drive does not report it."""
     current = run.current_a.copy()
     limit = float(np.percentile(np.abs(current[:, 1]), 90.0))
     current[:, 1] = np.clip(current[:, 1], -limit, limit)
@@ -311,27 +311,21 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     runs = {run.name: run for run in recorded}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     fitted = fit([Path(f"r{number}") for number in range(USED)])
-    finding = Finding(
-        effect=ZeroOffset(),
-        axis=1,
-        coefficients=np.array([np.radians(-4.0)]),
-        deviations=np.array([np.radians(0.1)]),
-        probability=0.001,
-        folds_better=1.0,
-        explained=0.5,
-        error_before_percent=5.0,
-        error_after_percent=4.0,
-        error_fall=0.2,
-        held_out_fall=9.0,
-        passed=True,
-        fold_errors=np.ones(8),
-    )
+    finding = passed_finding(ZeroOffset(), 1, np.radians(-4.0), np.radians(0.1))
     aside = SetAside(finding, "the squared error on runs left out rises")
     step = Step((), (), np.zeros(3), None, fitted.evidence(), set_aside=(aside,))
     (diagnosis,) = description_diagnoses(replace(fitted, steps=(step,)))
     assert (diagnosis.name, diagnosis.axes) == ("zero-off", ("J2",))
     assert "off by -4.00 ± 0.10°" in diagnosis.found
     assert "the gains are without this correction (the squared error on runs left out rises)" in diagnosis.found
+    # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be typed in.
+    late = passed_finding(LatePosition(), 1, 0.002, 1e-4)
+    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(), alike=(finding, late))
+    (unclear,) = description_diagnoses(replace(fitted, steps=(step,), description=check))
+    assert unclear.name == "correction-unclear"
+    assert "the zero of J2 off by -4.00 ± 0.10°" in unclear.found
+    assert "or the position of J2 late by 2.00 ± 0.10 ms" in unclear.found
+    assert "correct nothing in the cell file before that" in unclear.remedy
     in_its_noise = replace(step, left_open=(PlacedEffect(ZeroOffset(), 1),))
     assert description_diagnoses(replace(fitted, steps=(in_its_noise,))) == ()
 

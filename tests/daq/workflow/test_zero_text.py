@@ -20,6 +20,7 @@ from ident.discovery.search import Finding
 from ident.effects.geometry_corrections import ZeroOffset
 from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 from ident.model.geometry import GeometryKind, GeometryParameter
+from tests.ident.findings import passed_finding
 
 DECLARED_TOO_LARGE_DEG = (2.0, -2.0)
 STD_DEG = 0.04
@@ -27,21 +28,7 @@ STD_DEG = 0.04
 
 def _by_torque(value_rad: float) -> Finding:
     """A finding by torques: the offset that has to be added to the position of the second axis."""
-    return Finding(
-        effect=ZeroOffset(),
-        axis=1,
-        coefficients=np.array([value_rad]),
-        deviations=np.array([radians(STD_DEG)]),
-        probability=0.001,
-        folds_better=1.0,
-        explained=0.5,
-        error_before_percent=5.0,
-        error_after_percent=4.0,
-        error_fall=0.2,
-        held_out_fall=9.0,
-        passed=True,
-        fold_errors=np.ones(8),
-    )
+    return passed_finding(ZeroOffset(), 1, value_rad, radians(STD_DEG))
 
 
 def _by_encoders(value_rad: float) -> GeometryFinding:
