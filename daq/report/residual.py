@@ -38,6 +38,7 @@ from ident.estimators.estimate import RelativeError
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
+FEW_MOVES = "it rests on "  #: How the refusal of a candidate on few moves begins (`ident.discovery.few_moves`)
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
 WHEN = ("before", "after")
@@ -300,6 +301,7 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     sentences += [*_choice_sentence(fitted, account), _silence(fitted)]
     sentences += _unconfirmed_skew(account.skew)
     sentences += _refused(fitted)
+    sentences += _on_few_moves(fitted)
     sentences += gear_sentences(fitted)
     sentences += floor_sentences(account, fitted.cell.axis_names)
     is_judged_on_runs = bool(last.verdicts) or bool(runs_to_leave_out(last.after.training))
@@ -421,6 +423,21 @@ def _refused(fitted: Fit) -> Iterator[str]:
             f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
             f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
         )
+
+
+def _on_few_moves(fitted: Fit) -> Iterator[str]:
+    """Of each axis, name the candidate that helps most and rests on too few moves to be tested, and what to record."""
+    best: dict[int, tuple[Finding, str]] = {}
+    for finding in fitted.steps[-1].findings:
+        untested = next((refusal for refusal in finding.refusals if refusal.startswith(FEW_MOVES)), None)
+        lowers_the_error = finding.held_out_fall > 0.0 and not finding.impossible
+        # `_refused` names a large one with all that it failed.
+        if untested is not None and lowers_the_error and finding.explained < MUCH:
+            best.setdefault(finding.axis, (finding, untested))
+    axes = fitted.cell.place_names
+    for finding, untested in best.values():
+        name = placed_by(finding).axis_name(axes)
+        yield f"{name} may have {effect_text(finding.effect, axes)}, which was not added: {untested}."
 
 
 _FLOOR_CAUSES = {

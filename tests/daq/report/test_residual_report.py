@@ -57,6 +57,7 @@ from ident.discovery import before_after as before_after_module
 from ident.discovery.before_after import Account, RelativeErrors, account
 from ident.discovery.error_change import ErrorChange, PairedChange
 from ident.discovery.evidence import with_effects
+from ident.discovery.few_moves import RECORD, what_to_record
 from ident.discovery.gear_loss import GearLoss
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step
@@ -65,6 +66,7 @@ from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import PlacedEffect
+from ident.effects.electrical import Saturation
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.effects.position import Spring
@@ -649,6 +651,23 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
     assert "p =" not in sentence
     report = residual_report(asked, closed.account, calibration_of(closed.fitted, CREATED))
     assert report.turns[-1].findings[0].probability is None
+
+
+def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Closed) -> None:
+    two_moves_only = np.zeros((20, 1, 1))
+    two_moves_only[:2] = 1.0
+    why = what_to_record(Saturation(), two_moves_only, None)
+    untested = replace(finding(PlacedEffect(Saturation(), 1), passed=False), explained=0.01, refusals=(why,))
+    weaker = replace(untested, effect=Spring())
+    impossible = replace(untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0")
+    no_help = replace(untested, axis=3, held_out_fall=-1.0)
+    first, last = closed.fitted.steps
+    asked = replace(closed.fitted, steps=(first, replace(last, findings=(untested, weaker, impossible, no_help))))
+    sentences = [one for one in summary(asked, closed.account, ()) if "rests on" in one]
+    assert sentences == [
+        f"J2 may have {effect_text(Saturation(), ())}, which was not added: it rests on two moves, too few to test it: "
+        f"record more {RECORD[Abscissa.CURRENT]}."
+    ]
 
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:
