@@ -47,6 +47,7 @@ class ExitCode(IntEnum):
     BUS_TAKEN = 12
     TIME_BOUND = 13
     JOB_HELD = 14
+    NOT_ACCEPTED = 15
     INTERRUPTED = 130
 
 

@@ -54,7 +54,11 @@ def report_success(context: SessionContext, session: Session) -> Conclusion:
     """
     outcome = session.state.outcome or Outcome.STOPPED
     remark = "" if session.state.decision is None else session.state.decision.remark
-    code = ExitCode.PROPOSED if outcome is Outcome.PROPOSED else ExitCode.OK
+    code = ExitCode.OK
+    if outcome is Outcome.PROPOSED:
+        code = ExitCode.PROPOSED
+    elif _is_contradicted(session.state):
+        code = ExitCode.NOT_ACCEPTED
     return _report(context, session, outcome, code, remark, "")
 
 

@@ -139,7 +139,10 @@ def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, ma
     rig = made_session_rig(tmp_path / "cell", made_session)
     # The controller did not take the gains that were written: it has the previous gains.
     rig.tools = replace(rig.tools, validate=lambda *_: (made_session.before,))
-    assert run_session(rig).outcome is Outcome.APPLIED
+    ended = run_session(rig)
+    assert ended.outcome is Outcome.APPLIED
+    assert ended.exit_code == ExitCode.NOT_ACCEPTED
+    assert state_of(rig).exit_code == ExitCode.NOT_ACCEPTED
     acceptance = state_of(rig).acceptance
     assert acceptance is not None
     assert not acceptance.accepted
