@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from daq.documents.calibration_file import save_calibration
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress, RecordedRun
 from daq.errors import ExitCode
 from daq.jobs.position import sessions_folder
-from daq.jobs.session import Session, save
+from daq.jobs.session import Session, save, sessions
 from daq.log.conversion import scaling
 from daq.log.feed import Feed, QuickGain, QuickLook
 from daq.log.reader import Log, read_log
@@ -65,14 +65,21 @@ class Rig:
     """A simulated cell with its console, and a browser."""
 
     def __init__(
-        self, folder: Path, checkout: Path, browser: Browser, stack: ExitStack, faults: str, duration_s: str
+        self,
+        folder: Path,
+        checkout: Path,
+        browser: Browser,
+        stack: ExitStack,
+        faults: str,
+        duration_s: str,
+        simulated: Sequence[str] = ("clean",),
     ) -> None:
         self.folder, self.checkout, self.stack = folder, checkout, stack
         (folder / "faults.yaml").write_text(faults, encoding="utf-8")
         shutil.copytree(checkout / "configs", folder / "configs")
         self.cell_file = folder / "configs" / "cells" / "demo.yaml"
         given = ("--faults", str(folder / "faults.yaml")) if faults else ()
-        simulation = self.start("simulate", "clean", "--port", "0", *given)
+        simulation = self.start("simulate", *simulated, "--port", "0", *given)
         assert simulation.stdout is not None
         lines = list(iter(simulation.stdout.readline, "\n")) + list(iter(simulation.stdout.readline, "\n"))
         text = self.cell_file.read_text(encoding="utf-8")
@@ -405,3 +412,105 @@ def test_the_session_shows_the_gains_after_each_move(browser: Browser, cell: Cel
         assert page.locator("#precision circle.quick").count() == 2 * len(cell.axes)
         feed.finish()
         until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
+
+
+BLOCK_S = "10"
+TARGET_PERCENT = "1.5"
+
+
+class Technician:
+    """Answers `drivegain calibrate`, and changes what is mounted on the simulated cell."""
+
+    def __init__(self, command: subprocess.Popen[bytes], mounted: Path) -> None:
+        self.command = command
+        self.mounted = mounted
+        self.said = ""
+        self.answers = {"Mass of": "4.59", "The same once more": "4.59", "Type yes": "yes"}
+
+    def asked(self) -> str | None:
+        """The next question; None at the end of the command."""
+        assert self.command.stderr is not None
+        while not self.said.rpartition("\n")[2].startswith(">>> ") or not self.said.endswith(": "):
+            heard = os.read(self.command.stderr.fileno(), 65536)
+            if not heard:
+                return None
+            self.said += heard.decode()
+        return self.said.rpartition("\n>>> ")[2].removesuffix(": ")
+
+    def asked_for(self) -> str:
+        """What the last heading asks for: `NOTHING on the flange`."""
+        heading = re.findall(r"── \S+: (.+) ──", self.said)[-1]
+        return str(heading)
+
+    def mount(self) -> None:
+        """Mount what the last heading asks for."""
+        body = "none" if self.asked_for().startswith("NOTHING") else "disc"
+        self.mounted.write_text(f"{body}\n", encoding="utf-8")
+
+    def answer(self, question: str) -> None:
+        """Answer a question, with Enter where it asks for nothing else."""
+        given = next((text for begin, text in self.answers.items() if question.startswith(begin)), "")
+        self.said += "\n"
+        assert self.command.stdin is not None
+        self.command.stdin.write(f"{given}\n".encode())
+        self.command.stdin.flush()
+
+
+def newest_state(cell_file: Path, cell: Cell) -> GuidedState:
+    """State of the newest session, as its file has it."""
+    state = sessions(sessions_folder(cell_file), cell.name)[-1].state
+    assert isinstance(state, GuidedState)
+    return state
+
+
+def test_a_whole_session_is_shown_as_its_files_hold_it(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+    mounted = tmp_path / "mounted.txt"
+    mounted.write_text("none\n", encoding="utf-8")
+    simulated = ("demo", "--payload-from", str(mounted))
+    with ExitStack() as stack:
+        made = Rig(tmp_path, checkout, browser, stack, "", SHORT_S, simulated)
+        page = made.page
+        options = ("--enable-motion", "--block", BLOCK_S, "--target", TARGET_PERCENT)
+        command = subprocess.Popen(
+            [sys.executable, "-m", "daq", "calibrate", str(made.cell_file), *options],
+            cwd=checkout,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        stack.enter_context(command)
+        stack.callback(command.kill)
+        technician = Technician(command, mounted)
+        while (question := technician.asked()) is not None:
+            if "press Enter" in question and "cell" in question:
+                until(page, f"document.getElementById('next-step').textContent.startsWith('{technician.asked_for()}')")
+                technician.mount()
+                _precision_is_that_of(page, newest_state(made.cell_file, made.cell))
+            elif question.startswith("Type yes"):
+                until(page, "document.getElementById('next-step').textContent.includes('type yes')")
+            technician.answer(question)
+        assert command.stdout is not None
+        ending = command.stdout.read().decode()
+        assert command.wait(timeout=60) == ExitCode.OK, technician.said + ending
+        until(page, "document.getElementById('stage').textContent.startsWith('Stage: ended')")
+        state = newest_state(made.cell_file, made.cell)
+        assert state.acceptance is not None
+        assert f"Accepted: {state.acceptance.remark}" in page.inner_text("#outlook")
+        for run in state.runs:
+            assert run.name in page.inner_text("#stage")
+        _precision_is_that_of(page, state)
+        (checkout / "out" / "console").mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=checkout / "out" / "console" / "session.png", full_page=True)
+        assert made.refused == []
+
+
+def _precision_is_that_of(page: Page, state: GuidedState) -> None:
+    """The picture has σ of each gain after each judged block, and the last of each in words."""
+    if not state.progress:
+        return
+    until(page, f"window.drivegain.guided?.precision?.progress.length === {len(state.progress)}")
+    assert page.locator("#precision circle:not(.quick)").count() == len(state.progress) * len(state.gains)
+    labels = page.locator("#precision text").all_text_contents()
+    if page.locator("#precision circle.quick").count() == 0:
+        for gain, std_percent in zip(state.gains, state.progress[-1].std_percent, strict=True):
+            assert f"{gain.axis} {std_percent:.2f} %" in labels
