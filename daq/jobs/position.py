@@ -58,7 +58,7 @@ def goes_on_with(state: GuidedState) -> str:
 def position_of(state: GuidedState) -> Position:
     """Find the stage that a session is in, by what its state has and lacks."""
     if state.outcome is not None and state.is_over:
-        return Position(StageName.ENDED, f"nothing: the session has ended, {state.outcome.value}")
+        return Position(StageName.ENDED, f"The session has ended: {state.outcome.value}")
     recording = _recording_position(state)
     if recording is not None:
         return recording

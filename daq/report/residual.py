@@ -39,6 +39,8 @@ _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
 FEW_MOVES = "it rests on "  #: How the refusal of a candidate on few moves begins (`ident.discovery.few_moves`)
+LITTLE = 0.005  #: Share of the squared residual; a candidate on few moves that explains less is not worth a sentence
+MOST = 0.75  #: Share of the folds on which such a candidate must lower the error
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
 WHEN = ("before", "after")
@@ -430,14 +432,15 @@ def _on_few_moves(fitted: Fit) -> Iterator[str]:
     best: dict[int, tuple[Finding, str]] = {}
     for finding in fitted.steps[-1].findings:
         untested = next((refusal for refusal in finding.refusals if refusal.startswith(FEW_MOVES)), None)
-        lowers_the_error = finding.held_out_fall > 0.0 and not finding.impossible
         # `_refused` names a large one with all that it failed.
-        if untested is not None and lowers_the_error and finding.explained < MUCH:
+        is_of_size = LITTLE <= finding.explained < MUCH
+        helps = finding.held_out_fall > 0.0 and finding.folds_better >= MOST and not finding.impossible
+        if untested is not None and is_of_size and helps:
             best.setdefault(finding.axis, (finding, untested))
     axes = fitted.cell.place_names
     for finding, untested in best.values():
         name = placed_by(finding).axis_name(axes)
-        yield f"{name} may have {effect_text(finding.effect, axes)}, which was not added: {untested}."
+        yield f"These moves do not tell whether {name} has {effect_text(finding.effect, axes)}: {untested}."
 
 
 _FLOOR_CAUSES = {

@@ -661,12 +661,16 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     weaker = replace(untested, effect=Spring())
     impossible = replace(untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0")
     no_help = replace(untested, axis=3, held_out_fall=-1.0)
+    few_folds = replace(untested, axis=4, folds_better=0.5)
+    tiny = replace(untested, axis=5, explained=0.001)
     first, last = closed.fitted.steps
-    asked = replace(closed.fitted, steps=(first, replace(last, findings=(untested, weaker, impossible, no_help))))
+    asked = replace(
+        closed.fitted, steps=(first, replace(last, findings=(untested, weaker, impossible, no_help, few_folds, tiny)))
+    )
     sentences = [one for one in summary(asked, closed.account, ()) if "rests on" in one]
     assert sentences == [
-        f"J2 may have {effect_text(Saturation(), ())}, which was not added: it rests on two moves, too few to test it: "
-        f"record more {RECORD[Abscissa.CURRENT]}."
+        f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on two moves, "
+        f"too few to test it: record more {RECORD[Abscissa.CURRENT]}."
     ]
 
 
