@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.discovery.braking import pushing
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.evidence import (
     Evidence,
@@ -40,6 +41,7 @@ from ident.discovery.rotor_search import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.friction import SpeedFriction
 from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
@@ -325,5 +327,7 @@ def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generato
     place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
-    reasons = (*finding.refusals, joint, physics, PartsLeftOut.of(problem).refusal(columns))
+    is_of_speed = isinstance(placed.effect, SpeedFriction)
+    drives = pushing(model.evidence, placed.axis) if is_of_speed else ""
+    reasons = (*finding.refusals, joint, physics, drives, PartsLeftOut.of(problem).refusal(columns))
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -16,8 +17,23 @@ from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 
+class SpeedFriction(Effect):
+    """Friction that depends on the speed of its joint alone."""
+
+    __slots__ = ()
+    abscissa = Abscissa.VELOCITY
+
+    @abstractmethod
+    def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
+        """Torque per unit of each coefficient at velocities, shape (k,) → (p, k)."""
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (p, k)."""
+        return self.at_speed(signals.velocity_rad_s[axis])
+
+
 @dataclass(frozen=True, slots=True)
-class Stribeck(Effect):
+class Stribeck(SpeedFriction):
     """τ = c · sign(q̇) · exp(−|q̇|/η);  c > 0: more friction at low speed.
 
     Source: Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994), the exponential form of the Stribeck
@@ -26,19 +42,18 @@ class Stribeck(Effect):
 
     name = "stribeck"
     declares = Property.ODD_IN_VELOCITY
-    abscissa = Abscissa.VELOCITY
     coefficients = (Column("amplitude", "Nm", least=0.0),)
 
     speed_rad_s: Annotated[float, Range(1e-4, 1e2)]  #: η, between standstill and a tenth of full speed
 
-    def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1, k)."""
-        v = signals.velocity_rad_s[axis]
+    def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
+        """Torque per unit of the amplitude, shape (1, k)."""
+        v = velocity_rad_s
         return np.asarray(np.sign(v) * np.exp(-np.abs(v) / self.speed_rad_s))[None]
 
 
 @dataclass(frozen=True, slots=True)
-class NonlinearViscous(Effect):
+class NonlinearViscous(SpeedFriction):
     """τ = c · sign(q̇) · |q̇|^η;  c > 0: drag against the motion.
 
     Source: shear-thinning grease (η < 1) and churning losses (η = 2, 3); Harris & Kotzalas, Rolling Bearing Analysis,
@@ -47,7 +62,6 @@ class NonlinearViscous(Effect):
 
     name = "nonlinear-viscous"
     declares = Property.ODD_IN_VELOCITY
-    abscissa = Abscissa.VELOCITY
 
     exponent: Annotated[float, Range(0.05, 10.0)]  #: η; one would be the declared viscous friction itself
 
@@ -56,14 +70,14 @@ class NonlinearViscous(Effect):
         """Linear parameter, with a unit that depends on the exponent."""
         return (Column("coefficient", f"Nm/(rad/s)^{self.exponent:.3g}", least=0.0),)
 
-    def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1, k)."""
-        v = signals.velocity_rad_s[axis]
+    def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
+        """Torque per unit of the coefficient, shape (1, k)."""
+        v = velocity_rad_s
         return np.asarray(np.sign(v) * np.abs(v) ** self.exponent)[None]
 
 
 @dataclass(frozen=True, slots=True)
-class AsymmetricViscous(Effect):
+class AsymmetricViscous(SpeedFriction):
     """τ = c · |q̇|;  c > 0: more viscous friction in the positive direction than in the negative one.
 
     Source: the even part of Fv⁺q̇ for q̇ > 0, Fv⁻q̇ for q̇ < 0 (Swevers et al., IEEE TRA 13 (1997)); the odd part is the
@@ -72,12 +86,11 @@ class AsymmetricViscous(Effect):
 
     name = "asymmetric-viscous"
     declares = Property.EVEN_IN_VELOCITY
-    abscissa = Abscissa.VELOCITY
     coefficients = (Column("coefficient", "Nm/(rad/s)"),)
 
-    def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1, k)."""
-        return np.asarray(np.abs(signals.velocity_rad_s[axis]))[None]
+    def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
+        """Torque per unit of the coefficient, shape (1, k)."""
+        return np.asarray(np.abs(velocity_rad_s))[None]
 
 
 @dataclass(frozen=True, slots=True)

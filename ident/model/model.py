@@ -149,6 +149,11 @@ class Model:
         return JOINT_COLUMNS * np.arange(self.robot.joint_count)[:, None] + np.arange(len(LINK_PARAMETERS))
 
     @property
+    def viscous_friction_columns(self) -> IntArray:
+        """Column of fv of each axis among the standard ones, shape (m,)."""
+        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 11
+
+    @property
     def dry_friction_columns(self) -> IntArray:
         """Column of fs of each axis among the standard ones, shape (m,)."""
         return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 12

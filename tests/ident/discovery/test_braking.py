@@ -1,0 +1,111 @@
+"""Friction brakes at every speed: a fit in which terms of the speed drive the arm together is not written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery.braking import pushing
+from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.gates import Gates
+from ident.discovery.loop import find_effects
+from ident.effects.effect import PlacedEffect
+from ident.effects.friction import AsymmetricViscous, NonlinearViscous, SpeedFriction, Stribeck
+from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, three_axes_truth
+
+FloatArray = NDArray[np.float64]
+
+AXIS = 1
+NAMES = ("J1", "J2", "J3")
+GATES = Gates(draws=199)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return three_axes_truth()
+
+
+@pytest.fixture(scope="module")
+def clean(truth: Truth) -> Evidence:
+    rng = np.random.default_rng(11)
+    payloads = (None, MOUNTED, None, MOUNTED)
+    runs = [
+        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0)
+        for number, payload in enumerate(payloads)
+    ]
+    return gathered(truth, tuple(runs))
+
+
+def _with_friction(clean: Evidence, truth: Truth, friction_nm: object) -> Evidence:
+    """Recordings with a friction of its own on one axis, a function of the speed's size."""
+    assert callable(friction_nm)
+
+    def torque(data: Dataset) -> FloatArray:
+        velocity = data.velocity_rad_s[:, AXIS]
+        own = np.sign(velocity) * friction_nm(np.abs(velocity))
+        return acting_on(AXIS, len(truth.gains), own)
+
+    return bent(clean, truth, torque)
+
+
+def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(clean: Evidence, truth: Truth) -> None:
+    # Drag by a root of the speed where there is none, and 20 Nm less dry friction than the axis has.
+    worn = _with_friction(clean, truth, lambda speed: 25.0 * speed ** (1.0 / 3.0) - 20.0)
+    placed = PlacedEffect(NonlinearViscous(1.0 / 3.0), AXIS)
+    fitted = with_effects(worn, (placed,))
+    said = pushing(fitted, AXIS)
+    assert said.startswith("the friction of this axis would push the arm at rest (-1")
+    assert said.endswith(" Nm)")
+    assert pushing(fitted, 0) == ""
+    assert pushing(clean, AXIS) == ""
+
+
+def test_the_search_writes_no_friction_that_drives_the_arm(clean: Evidence, truth: Truth) -> None:
+    worn = _with_friction(clean, truth, lambda speed: 25.0 * speed ** (1.0 / 3.0) - 20.0)
+    steps = find_effects(worn, np.random.default_rng(0), GATES)
+    end = steps[-1].after
+    assert all(pushing(end, axis) == "" for axis in range(3))
+    aside = [one for step in steps for one in step.set_aside]
+    assert any("would push the arm" in one.reason(NAMES) for one in aside)
+
+
+@pytest.mark.parametrize(
+    ("effect", "friction_nm"),
+    [
+        (NonlinearViscous(1.0 / 3.0), lambda speed: 6.0 * speed ** (1.0 / 3.0)),
+        (NonlinearViscous(2.0), lambda speed: 3.0 * speed**2),
+        (Stribeck(0.3), lambda speed: 5.0 * np.exp(-speed / 0.3)),
+    ],
+)
+def test_friction_that_brakes_is_still_found(
+    clean: Evidence, truth: Truth, effect: SpeedFriction, friction_nm: object
+) -> None:
+    worn = _with_friction(clean, truth, friction_nm)
+    end = find_effects(worn, np.random.default_rng(0), GATES)[-1].after
+    assert [(placed.effect.name, placed.axis) for placed in end.effects] == [(effect.name, AXIS)]
+    assert pushing(end, AXIS) == ""
+
+
+def test_a_direction_in_which_the_arm_would_be_driven_is_seen(clean: Evidence, truth: Truth) -> None:
+    placed = PlacedEffect(AsymmetricViscous(), AXIS)
+    fitted = with_effects(clean, (placed,))
+    index = [column.name for column in fitted.estimate.unknowns].index(placed.columns[0].name)
+    for value in (50.0, -50.0):
+        parameters = fitted.estimate.parameters.copy()
+        parameters[index] = value
+        lopsided = replace(fitted, estimate=replace(fitted.estimate, parameters=parameters))
+        expected = "-" if value > 0.0 else ""
+        assert f"would push the arm at {expected}" in pushing(lopsided, AXIS)
+
+
+@pytest.mark.parametrize("effect", [Stribeck(0.2), NonlinearViscous(0.5), AsymmetricViscous()])
+def test_columns_are_the_torque_at_the_speed_of_the_joint(effect: SpeedFriction) -> None:
+    velocity = np.linspace(-2.0, 2.0, 101)
+    columns = effect.at_speed(velocity)
+    assert columns.shape == (len(effect.coefficients), len(velocity))
+    is_even = isinstance(effect, AsymmetricViscous)
+    np.testing.assert_allclose(columns, effect.at_speed(-velocity) * (1.0 if is_even else -1.0), atol=1e-12)
