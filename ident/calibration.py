@@ -13,6 +13,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
+from ident.model.bodies import LOADED
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.evidence import Evidence
@@ -54,6 +55,11 @@ class Parameter:
     value: float
     std: float
     unit: str
+
+    @property
+    def is_of_load(self) -> bool:
+        """Whether it is, or leads with, what a payload adds to friction (`Model.friction_by_load`)."""
+        return self.name.split(" ", 1)[0].endswith(LOADED)
 
     @property
     def std_percent(self) -> float:
@@ -216,6 +222,11 @@ class Calibration:
     def places(self) -> tuple[str, ...]:
         """Names of the axes, then of the joints without a motor, as in `Robot.places`."""
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
+
+    @property
+    def friction_by_load(self) -> bool:
+        """Whether friction with a payload has parameters of its own."""
+        return any(parameter.is_of_load for parameter in self.parameters)
 
     @property
     def gains_fixed(self) -> bool:

@@ -19,11 +19,11 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import PlacedEffect, is_placeable
-from ident.effects.geometry_corrections import corrected_dataset, corrected_model
+from ident.effects.geometry_corrections import corrected_dataset
 from ident.effects.signals import declared_signals
 from ident.equations.rows import at_rows
 from ident.model.model import Model
-from ident.prediction import corrections_of, payload_of, standard_parameters
+from ident.prediction import corrections_of, fitted_model, payload_of, standard_parameters
 
 LEAST_SHARE = 0.5  #: Of the squared error beyond that of the fit, friction and gains, that it must explain
 SMALLEST_SHARE = 0.03  #: Of the whole squared error that it must explain: less is not worth a word
@@ -63,12 +63,11 @@ def geometry_drift(
         return None  # internal preload hides a part of the torque
     corrections = corrections_of(calibration)
     # What has changed since is counted from the corrected gravity, not from the declared one.
-    corrected = corrected_model(model, corrections)
-    model = Model(replace(corrected.robot, declared_gravity_m_s2=None), model.drive_train)
+    corrected = fitted_model(calibration, model)
+    model = replace(corrected, robot=replace(corrected.robot, declared_gravity_m_s2=None))
     slow = at_rows(corrected_dataset(data, corrections), conditioning)
     move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
-    standard = standard_parameters(calibration, model)
-    standard[model.flange] += payload_of(calibration, data)
+    standard = model.mounted(standard_parameters(calibration, model), payload_of(calibration, data))
     gains = np.array([gain.value for gain in calibration.gains])
     signals = declared_signals(model, slow, standard, gains, calibration.session_began_s, inertia=False)
     scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])

@@ -43,10 +43,9 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     """
     gains = _gains(calibration, model)
     corrections = corrections_of(calibration)
-    model = corrected_model(model, corrections)
+    model = fitted_model(calibration, model)
     data = corrected_dataset(data, corrections)
-    standard = standard_parameters(calibration, model)
-    standard[model.flange] += payload_of(calibration, data)
+    standard = model.mounted(standard_parameters(calibration, model), payload_of(calibration, data))
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
@@ -60,6 +59,16 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
+
+
+def fitted_model(calibration: Calibration, model: Model) -> Model:
+    """The declared model as a calibration has corrected its geometry, with friction by load where it has identified it.
+
+    Raises:
+        EffectRefused: it holds an effect that does not exist.
+    """
+    model = corrected_model(model, corrections_of(calibration))
+    return replace(model, friction_by_load=True) if calibration.friction_by_load else model
 
 
 def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
@@ -141,6 +150,7 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
 
     A base parameter β gathers the columns that depend on its leading one (paper §2.1), W_st χ_st = W β for every χ_st
     with this β; the simplest one holds β at the leading columns, which name the base parameters, and zero elsewhere.
+    What a payload adds to friction is left out where the model has no friction by load.
 
     Raises:
         ModelError: a parameter is none of this robot's.
@@ -150,6 +160,8 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     standard = np.zeros(len(index))
     for parameter in calibration.parameters:
         if parameter.name in of_effects or ":" in parameter.name:
+            continue
+        if parameter.is_of_load and not model.friction_by_load:
             continue
         leading = parameter.name.split()[0] if parameter.name.split() else ""
         if leading not in index:
@@ -238,15 +250,17 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
     return np.array([gain.value for gain in calibration.gains])
 
 
-def payload_of(calibration: Calibration, data: Dataset) -> FloatArray:
+def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
     """χ_L of what a run carries: from the run, and what the calibration has identified of its mounting, shape (10,).
+
+    None without load.
 
     Raises:
         DataUnfit: the calibration does not know the mounting, or knows the payload with another mass.
     """
     payload = data.payload
     if payload is None:
-        return np.zeros(len(LINK_PARAMETERS))
+        return None
     mountings = {name.partition(":")[2] for name in (one.name for one in calibration.parameters) if ":" in name}
     own = mounted_parameters(calibration, payload.mounting)
     identified = {name: parameter.value for name, parameter in own.items()}

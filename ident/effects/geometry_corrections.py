@@ -248,7 +248,7 @@ def corrected_model(model: Model, effects: Iterable[PlacedEffect]) -> Model:
     for placed in effects:
         if isinstance(placed.effect, GeometryEffect):
             robot = placed.effect.correct_robot(robot, placed.axis)
-    return model if robot is model.robot else Model(robot, model.drive_train)
+    return model if robot is model.robot else replace(model, robot=robot)
 
 
 def corrected_dataset(data: Dataset, effects: Iterable[PlacedEffect]) -> Dataset:

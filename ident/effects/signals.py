@@ -83,7 +83,7 @@ class Arm:
         robot = replace(self.model.robot, gravity_m_s2=gravity_m_s2)
         still = np.zeros_like(self.motion.position_rad)
         at_rest = Motion(self.motion.position_rad, still, still)
-        return Model(robot, self.model.drive_train).torques(at_rest, self.standard)[0]
+        return replace(self.model, robot=robot).torques(at_rest, self.standard)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +202,8 @@ def fitted_signals(
             values = estimate.parameters[first : first + len(indices)]
             identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
-    standard[model.flange] += payload_parameters(data.payload, identified)
+    body = None if data.payload is None else payload_parameters(data.payload, identified)
+    standard = model.mounted(standard, body)
     return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
 
 

@@ -220,6 +220,7 @@ def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observat
     for index, data in enumerate(datasets):
         if data.demanded is not None:
             own = rows.run == index
-            standard = model.regressor(demanded_at_rows(data.demanded, row_filter(data, rows.conditioning)))
+            asked = demanded_at_rows(data.demanded, row_filter(data, rows.conditioning))
+            standard = model.regressor(asked, loaded=data.payload is not None)
             regressor[:, :, own], flange[:, :, own] = standard[:, base], standard[:, model.flange]
     return replace(rows, regressor=regressor, flange=flange)

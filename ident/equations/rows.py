@@ -125,11 +125,12 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     time_s, move = data.time_s[centres] - data.time_s[0], data.move[centres]
     first, support = 0, model.support
     asked = None if data.demanded is None else demanded_at_rows(data.demanded, filter_)
+    loaded = data.payload is not None
     for part in chunks(filter_, len(data.time_s), chunk_rows):
         if model.is_redundant:
             standard, drive, preload = _balanced(model, data, part, filter_)
         else:
-            regressor = model.regressor(data.motion(part))
+            regressor = model.regressor(data.motion(part), loaded=loaded)
             standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
             standard[support] = filter_(regressor[support])
             drive = preload = np.empty((len(support), 0, standard.shape[2]))
@@ -138,7 +139,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         yield Rows(
             current=filter_(data.current_a[part].T),
             standard=standard,
-            instrument=standard if asked is None else model.regressor(_part(asked, piece)),
+            instrument=standard if asked is None else model.regressor(_part(asked, piece), loaded=loaded),
             use=use[:, piece],
             motor_use=motor_use[:, piece],
             time_s=time_s[piece],
@@ -156,7 +157,7 @@ def _balanced(
     Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to sample; then, with an A
     that went through the same filter, they are written as torques of the axes.
     """
-    columns, to_motors = model.balance(data.motion(part))
+    columns, to_motors = model.balance(data.motion(part), loaded=data.payload is not None)
     currents = data.current_a[part].T
     slow = filter_(to_motors)
     standard = spread(filter_(columns), slow)

@@ -228,7 +228,7 @@ def _numbers(values: FloatArray) -> str:
 
 def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
     """The same model under another gravity."""
-    return Model(replace(model.robot, gravity_m_s2=gravity_m_s2), model.drive_train)
+    return replace(model, robot=replace(model.robot, gravity_m_s2=gravity_m_s2))
 
 
 def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: FloatArray) -> TurnedGeometry | None:
@@ -965,7 +965,7 @@ def _mountings(instants: Sequence[Instants]) -> list[str]:
 
 def _motor_columns(model: Model, one: Instants, motion: Motion, mountings: Sequence[str]) -> FloatArray:
     """Columns (T W)_i of the standard parameters, then of the body of each mounting, shape (m, c, k)."""
-    standard = model.regressor(motion)
+    standard = model.regressor(motion, loaded=one.mounting is not None)
     bodies = np.zeros((len(standard), len(LINK_PARAMETERS) * len(mountings), standard.shape[2]))
     if one.mounting is not None:
         first = len(LINK_PARAMETERS) * mountings.index(one.mounting)

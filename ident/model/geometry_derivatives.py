@@ -7,6 +7,7 @@ through everything: the way of all passive joints, their velocities and accelera
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def model_with_geometry(model: Model, changes: Iterable[GeometryChange]) -> Mode
     Raises:
         ModelError: the robot has no such joint or link, or its loops do not close with them.
     """
-    return Model(with_geometry(model.robot, changes), model.drive_train)
+    return replace(model, robot=with_geometry(model.robot, changes))
 
 
 def torque_derivative(

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.errors import ModelError
-from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
 from ident.model.robot import JointKind, Motion, Robot
@@ -98,10 +98,15 @@ class Model:
     four are zero columns. A motor that turns with several joints adds three (eq. 25): Iam, fvm, fsm. Its rotor inertia
     and viscous friction act on the joints through r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm
     carry the off-diagonal part, as in the paper.
+
+    Friction is not the same in all runs: it falls while the arm warms up, and changes with the torque on the gears.
+    Where the runs without load come first, the change looks like other gains. With `friction_by_load`, each friction
+    parameter has one more at the end, NAME_loaded: what is added to it while a payload is mounted. The paper has none.
     """
 
     robot: Robot
     drive_train: DriveTrain  #: between motors and the joints of the axes
+    friction_by_load: bool = False  #: whether friction with a payload is another one than without
     assembly: Assembly = field(init=False, compare=False, repr=False)  #: which joints are free, and how the loops close
     #: Followed motions by the digest of what was asked, the last one first.
     _followed: tuple[tuple[bytes, TreeMotion], ...] = field(default=(), init=False, compare=False, repr=False)
@@ -141,6 +146,9 @@ class Model:
             force, rate, inertia = DRIVE_UNITS[self.robot.axes[self.drive_train.joints[motor]].kind]
             coupling = ("Iam", inertia), ("fvm", f"{force}/({rate})"), ("fsm", force)
             columns += [Column(f"{name}{motor + 1}", unit) for name, unit in coupling]
+        if self.friction_by_load:
+            friction = [columns[place] for place in self.friction_columns]
+            columns += [replace(column, name=f"{column.name}{LOADED}") for column in friction]
         return tuple(columns)
 
     @property
@@ -172,6 +180,12 @@ class Model:
         return np.concatenate((of_axes.ravel(), of_coupled.ravel()))
 
     @property
+    def loaded_friction_columns(self) -> IntArray:
+        """Columns of what a payload adds to the friction parameters, in the order of `friction_columns`; or empty."""
+        declared = JOINT_COLUMNS * self.robot.joint_count + 3 * len(self.drive_train.coupled)
+        return declared + np.arange(len(self.friction_columns) if self.friction_by_load else 0)
+
+    @property
     def flange(self) -> slice:
         """The ten columns of the link that carries the payload; a payload on it has the same."""
         first = JOINT_COLUMNS * self.robot.carrier
@@ -197,13 +211,16 @@ class Model:
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
             out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
+        if self.friction_by_load:
+            out[:, self.loaded_friction_columns] = out[:, self.friction_columns]
         return out
 
-    def regressor(self, motion: Motion) -> FloatArray:
+    def regressor(self, motion: Motion, *, loaded: bool = False) -> FloatArray:
         """Torque at each axis per unit of every standard parameter, B Gᵀ W.
 
         Args:
             motion: of the m axes over k samples.
+            loaded: whether a payload is mounted. Its inertia has the columns of the link that carries it.
 
         Returns:
             shape (m, c, k) [Nm or N per unit], time last.
@@ -212,17 +229,17 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         if not self.robot.closures:
-            return self._tree_regressor(*self._joint_first(motion))
-        columns, to_motors = self.balance(motion)
+            return self._tree_regressor(*self._joint_first(motion), loaded=loaded)
+        columns, to_motors = self.balance(motion, loaded=loaded)
         return spread(columns, to_motors) if self.is_redundant else columns
 
-    def balance(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    def balance(self, motion: Motion, *, loaded: bool = False) -> tuple[FloatArray, FloatArray]:
         """Columns of the d equations of virtual power, Gᵀ W and Aᵀ, shapes (d, c, k) and (d, m, k).
 
         Arguments and errors are those of `regressor`.
         """
         followed = self.follow(motion)
-        columns = self._tree_regressor(*self._first(followed.joints))
+        columns = self._tree_regressor(*self._first(followed.joints), loaded=loaded)
         projected = np.zeros((self.assembly.mobility, *columns.shape[1:]))
         per_joint = np.ascontiguousarray(np.transpose(followed.to_joints, (1, 2, 0)))
         for joint, part in enumerate(columns):  # most links are moved by few joints
@@ -260,7 +277,9 @@ class Model:
         object.__setattr__(self, "_followed", tuple(kept))
         return found
 
-    def _tree_regressor(self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
+    def _tree_regressor(
+        self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, *, loaded: bool
+    ) -> FloatArray:
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
@@ -279,7 +298,24 @@ class Model:
             out[axes, first] = cross @ acceleration[axes]
             out[axes, first + 1] = cross @ velocity[axes]
             out[axes, first + 2] = r[:, None] * np.sign(motor_speed[motor])
+        if loaded and self.friction_by_load:
+            out[:, self.loaded_friction_columns] = out[:, self.friction_columns]
         return out
+
+    def mounted(self, standard: FloatArray, body: FloatArray | None) -> FloatArray:
+        """Standard parameters of the robot with what is mounted, shape (c,).
+
+        Args:
+            standard: χ_st without payload, shape (c,).
+            body: the ten parameters of what is mounted, shape (10,); None without load.
+        """
+        if body is None:
+            return standard
+        whole = standard.copy()
+        whole[self.flange] += body
+        if self.friction_by_load:
+            whole[self.friction_columns] += standard[self.loaded_friction_columns]
+        return whole
 
     def torques(self, motion: Motion, standard: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Torque of links and payload at each axis, the same with friction of the axes, and all [Nm or N], each (m, k).
@@ -288,14 +324,15 @@ class Model:
 
         Args:
             motion: of m axes over k samples.
-            standard: χ_st, shape (c,).
+            standard: χ_st with what is mounted (`mounted`), shape (c,).
 
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         position, velocity, acceleration = self._joint_first(motion)
-        links, motors = np.split(standard, [JOINT_COLUMNS * self.robot.joint_count])
-        links, motors = links.reshape(-1, JOINT_COLUMNS), motors.reshape(-1, 3, 1)
+        of_joints = JOINT_COLUMNS * self.robot.joint_count
+        links = standard[:of_joints].reshape(-1, JOINT_COLUMNS)
+        motors = standard[of_joints : of_joints + 3 * len(self.drive_train.coupled)].reshape(-1, 3, 1)
         own = links[list(self.robot.axis_joints)]
         followed = self.follow(motion) if self.robot.closures else None
         if followed is None:

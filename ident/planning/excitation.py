@@ -142,7 +142,8 @@ class Design:
         """
         expected = self.expectation
         flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
-        columns = expected.model.regressor(excitation.motion)[
+        # What a payload adds to friction has columns here, and none in the runs without one (`columns`).
+        columns = expected.model.regressor(excitation.motion, loaded=True)[
             :, np.concatenate((self.base.independent, flange)).astype(np.intp)
         ]
         motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
@@ -236,7 +237,11 @@ class Design:
     def columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
         """Unknowns of a run, and the columns of ``whitened`` that they belong to."""
         base = len(self.base.independent)
-        place, source = list(range(base)), list(range(base))
+        place = list(range(base))
+        if payload is None:
+            of_load = set(self.expectation.model.loaded_friction_columns.tolist())
+            place = [index for index in place if self.base.independent[index] not in of_load]
+        source = list(place)
         if payload is not None:
             unknown = self.expectation.payloads[payload].unknown
             before = sum(len(other.unknown) for other in self.expectation.payloads[:payload])
@@ -245,9 +250,13 @@ class Design:
         return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
 
     def condition(self, information: FloatArray) -> float:
-        """Condition number of the observation matrix W, rows weighted by their noise; inf for a column without rows."""
-        base = len(self.base.independent)
-        values = np.linalg.eigvalsh(information[:base, :base])
+        """Condition number of the observation matrix W, rows weighted by their noise; inf for a column without rows.
+
+        What a payload adds to friction is left out: in bare or in loaded runs alone it is no unknown of its own.
+        """
+        of_load = self.expectation.model.loaded_friction_columns
+        asked = np.flatnonzero(~np.isin(self.base.independent, of_load))
+        values = np.linalg.eigvalsh(information[np.ix_(asked, asked)])
         return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
 
     def std_percent(self, information: FloatArray) -> FloatArray:

@@ -237,3 +237,24 @@ def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
     found = {visible_base(model, _motion(np.random.default_rng(seed), 700)).independent for seed in range(4)}
     assert len(found) == 1
     assert len(found.pop()) == 61
+
+
+def test_what_a_payload_adds_to_friction_is_seen_in_loaded_runs_alone(truth: Truth) -> None:
+    model = replace(truth.model, friction_by_load=True)
+    rng = np.random.default_rng(21)
+    runs = [record(truth, f"run{number}", rng, payload, seconds=8.0) for number, payload in enumerate((None, MOUNTED))]
+    base = identify(model, runs, CONDITIONING, judge=False).system.base
+    parameters = np.concatenate((truth.parameters, np.zeros(len(model.loaded_friction_columns))))
+    noise = np.full(6, NOISE_A)
+    payload = ExpectedPayload(frozenset({"m"}), PAYLOAD)
+    design = Design(Expectation(model, truth.gains, parameters, (payload,), noise), base)
+    of_load = [place for place, column in enumerate(base.independent) if column in model.loaded_friction_columns]
+    assert len(of_load) == len(model.loaded_friction_columns)
+    excitation = _excitation(rng)
+    bare = design.information(excitation, (None,))
+    loaded = design.information(excitation, (0,))
+    assert not bare[of_load].any()
+    assert np.all(np.diag(loaded)[of_load] > 0.0)
+    for seen in (bare, loaded, bare + loaded):
+        assert np.isfinite(design.condition(seen))
+    assert np.isfinite(design.std_percent(bare + loaded)).all()
