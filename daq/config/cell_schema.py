@@ -272,6 +272,13 @@ class CellModel(StrictModel):
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
     effects: tuple[EffectModel, ...] = ()
+    friction_by_load: Annotated[
+        bool,
+        Field(
+            description="Whether friction with a payload has parameters of its own, so that friction that changes "
+            "between bare and loaded runs does not become gain."
+        ),
+    ] = False
     conditioning: ConditioningModel = ConditioningModel()
     controller: Controller | None = None
     workspace: WorkspaceSection | None = None

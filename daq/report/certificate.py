@@ -28,7 +28,7 @@ from daq.report.text import minute_text
 from daq.writeback.gates.gate import Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import GainChange, GainOrigin
-from ident.calibration import Calibration, EncoderMisfit, PayloadMass, Source
+from ident.calibration import Calibration, EncoderMisfit, PayloadMass
 from ident.data.run import Recording
 
 
@@ -507,7 +507,7 @@ def identity(calibration: Calibration) -> dict[str, str]:
         "Payload": payloads or "none: every run was recorded without load",
         "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
     }
-    order = order_text(calibration.sources)
+    order = order_text(calibration)
     if order:
         names["Order of runs"] = order
     if calibration.encoder_misfit is not None:
@@ -516,17 +516,15 @@ def identity(calibration: Calibration) -> dict[str, str]:
     return names
 
 
-def order_text(sources: Sequence[Source]) -> str:
+def order_text(calibration: Calibration) -> str:
     """In which order bare and loaded runs of the fit were recorded, and what that does to slow changes.
 
     Empty where a time is not known, or all runs are of one kind. The means of their places in the order are compared:
-    friction that changes evenly from run to run is the same for both kinds where these are equal.
-
-    Args:
-        sources: of the calibration.
+    friction that changes evenly from run to run is the same for both kinds where these are equal. With friction by load
+    the order does not matter.
     """
     timed: list[tuple[float, bool]] = []
-    for source in sources:
+    for source in calibration.sources:
         if source.role != FIT_ROLE:
             continue
         if source.recording is None or source.recording.recorded_s is None:
@@ -538,6 +536,8 @@ def order_text(sources: Sequence[Source]) -> str:
     if not loaded_places or not bare_places:
         return ""
     listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
+    if calibration.friction_by_load:
+        return f"{listed}; fitted with friction by load, so a warm-up moves no gain"
     later = fmean(loaded_places) - fmean(bare_places)
     if abs(later) <= BALANCED_PLACES:
         return f"{listed}; so an even warm-up moves no gain"

@@ -33,7 +33,6 @@ from ident.effects.friction import TemperatureFriction
 from ident.effects.geometry_corrections import (
     GravityDirection,
     ZeroOffset,
-    corrected_model,
     turn_between,
     turned_gravity,
 )
@@ -54,7 +53,7 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import (
     as_calibrated,
-    corrections_of,
+    fitted_model,
     measured_torque,
     mounted_parameters,
     placed_effect,
@@ -421,8 +420,7 @@ def cross_validate(
 
 def _standard_system(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> System:
     """Equations of one run in standard parameters, of the description as the calibration corrects it."""
-    corrected = corrected_model(model, corrections_of(calibration))
-    return reduce_runs(corrected, (run,), conditioning)
+    return reduce_runs(fitted_model(calibration, model), (run,), conditioning)
 
 
 def _condition(calibration: Calibration, standard: System) -> float:

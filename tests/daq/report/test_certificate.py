@@ -428,14 +428,22 @@ def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
     ],
 )
 def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str, said: str) -> None:
-    text = order_text(_recorded_in_order(payloads))
-    assert text == said
+    calibration = replace(demo_calibration(), sources=_recorded_in_order(payloads))
+    assert order_text(calibration) == said
+
+
+def test_with_friction_by_load_no_order_of_runs_moves_the_gains() -> None:
+    by_load = Parameter("fs1_loaded", -0.4, 0.1, "Nm")
+    declared = demo_calibration()
+    calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, by_load))
+    said = "bare, bare, loaded, loaded; fitted with friction by load, so a warm-up moves no gain"
+    assert order_text(calibration) == said
 
 
 def test_an_order_that_no_clock_tells_is_not_said() -> None:
     first, *others = _recorded_in_order("bllb")
     unknown = replace(first, recording=None)
-    assert order_text((unknown, *others)) == ""
+    assert order_text(replace(demo_calibration(), sources=(unknown, *others))) == ""
 
 
 def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
