@@ -1,9 +1,7 @@
-"""The schedule of a guided session: short blocks, bare and loaded in turn, until every gain is precise.
+"""The schedule of a guided session: short blocks, bare and loaded, until every gain is precise.
 
 The first three blocks are bare, loaded, and loaded again but held out: with these, gains and their σ are known, and one
-change of the payload is enough. Where they are not precise yet, blocks follow in pairs, loaded, bare, bare, loaded, so
-that the means of the bare and of the loaded blocks lie at the same time. Friction that changes slowly as the arm gets
-warm is then the same for both, and does not become gain.
+change of the payload is enough. `block_order` says which kind comes next.
 
 The moves of the first three blocks are for all gains. Those of every later block are for the gain that is farthest from
 its target by then, inside the room and the speed of the first three, which the operator has looked at.
@@ -15,7 +13,6 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import Enum
 from itertools import count
 from pathlib import Path
 
@@ -27,6 +24,7 @@ from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
 from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, writing
 from daq.jobs.block_check import compared_with, mistake_in
+from daq.jobs.block_order import FIRST_BLOCKS, BlockRole, BlocksSoFar, fixed_role, quickest_role
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, move_without_log
@@ -41,25 +39,6 @@ from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
 MAX_REPETITIONS = 3  #: Of one block, before the session is held
-
-
-class BlockRole(Enum):
-    """What a block is for."""
-
-    BARE = "bare"
-    LOADED = "loaded"
-    HELD_OUT = "held-out"
-
-
-FIRST_BLOCKS = (BlockRole.BARE, BlockRole.LOADED, BlockRole.HELD_OUT)
-NEXT_BLOCKS = (BlockRole.LOADED, BlockRole.BARE, BlockRole.BARE, BlockRole.LOADED)
-
-
-def role_of(number: int) -> BlockRole:
-    """Return the role of a block by its number from 0."""
-    if number < len(FIRST_BLOCKS):
-        return FIRST_BLOCKS[number]
-    return NEXT_BLOCKS[(number - len(FIRST_BLOCKS)) % len(NEXT_BLOCKS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +111,7 @@ class UntilPrecise:
             return session, None
         require_same_cell(context)
         number = _next_number(state)
-        role = role_of(number)
+        role = self._role_of(context, state, state.gains, number)
         payload = None
         mass_kg = None
         if role is not BlockRole.BARE:
@@ -140,7 +119,7 @@ class UntilPrecise:
             mass_kg = state.mass_kg or context.operator.weigh(payload)
             session = session.update(mass_kg=mass_kg)
         block = Block(
-            name=name_of(number),
+            name=name_of(number, role),
             payload=payload,
             mass_kg=mass_kg,
             holdout=role is BlockRole.HELD_OUT,
@@ -151,10 +130,30 @@ class UntilPrecise:
             plan = self.plan_block(context, number, path)
         else:
             plan = self._later_plan(context, session, number, path)
+            say_moves(context, block.name, path)
         # In the place of one that is recorded again.
         blocks = (*state.blocks[:number], block, *state.blocks[number:])
         session = session.update(blocks=blocks)
         return session, NextRun(_planned(session, block), plan)
+
+    def _role_of(
+        self, context: SessionContext, state: GuidedState, gains: Sequence[GainSoFar], number: int
+    ) -> BlockRole:
+        """Return the role of the next block.
+
+        Args:
+            context: of the session.
+            state: with the blocks before it.
+            gains: by these blocks; empty where they are not known yet.
+            number: of the block, from 0.
+        """
+        is_free = number >= len(FIRST_BLOCKS) and context.cell.friction_by_load and bool(gains)
+        if not is_free:
+            return fixed_role(number)
+        loads = [block.payload is not None for block in state.blocks if not block.holdout]
+        so_far = BlocksSoFar(loads.count(False), loads.count(True), is_mounted=state.blocks[-1].payload is not None)
+        variance_ratio = max((gain.std_percent / gain.target_percent) ** 2 for gain in gains)
+        return quickest_role(so_far, variance_ratio, self.settings.block_s)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
@@ -249,7 +248,8 @@ class UntilPrecise:
             return
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
-        is_loaded = role_of(number) is not BlockRole.BARE
+        role = self._role_of(context, guided(session), estimate.gains, number)
+        is_loaded = role is not BlockRole.BARE
         seed = self.settings.seed + number
         duration_s = self.settings.block_s
         context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
@@ -283,7 +283,6 @@ class UntilPrecise:
             planned = load_plan(path, context.cell)
         if planned is None:
             planned = self._unaimed_plan(context, session, number, path)
-        say_moves(context, name_of(number), path)
         return planned
 
     def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
@@ -319,8 +318,9 @@ class UntilPrecise:
         return accepted_room(context.cell, experiment.scene, plans)
 
     def plan_block(self, context: SessionContext, number: int, path: Path) -> Plan:
-        """Make the moves of a block by its number from 0."""
-        return plan_moves(context, name_of(number), path, self.settings.seed + number, self.settings.block_s)
+        """Make the moves of one of the first blocks by its number from 0."""
+        name = name_of(number, FIRST_BLOCKS[number])
+        return plan_moves(context, name, path, self.settings.seed + number, self.settings.block_s)
 
     def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
         """Estimate the gains of the blocks so far; none where they cannot be identified yet."""
@@ -383,15 +383,15 @@ def plan_name(number: int) -> str:
     return f"plan-{number + 1}.yaml"
 
 
-def name_of(number: int) -> str:
+def name_of(number: int, role: BlockRole) -> str:
     """Return the name of a block by its number from 0."""
-    return f"block-{number + 1}-{role_of(number).value}"
+    return f"block-{number + 1}-{role.value}"
 
 
 def _next_number(state: GuidedState) -> int:
     """Return the number of the first block that is not there."""
-    names = {block.name for block in state.blocks}
-    return next(number for number in count() if name_of(number) not in names)
+    taken = {int(block.name.split("-")[1]) - 1 for block in state.blocks}
+    return next(number for number in count() if number not in taken)
 
 
 def plan_moves(context: SessionContext, run: str, path: Path, seed: int, duration_s: float) -> Plan:

@@ -1,12 +1,13 @@
-"""How far friction that falls while the arm warms up bends the gains, by the order of bare and loaded blocks.
+"""How far friction that falls while the arm warms up bends the gains, by the order of blocks and by the model.
 
     python -m tests.studies.warm_up_study --seeds 1 2 3
     python -m tests.studies.warm_up_study --shard 1/2 --minutes 30      goes on where it ended
 
 Each cell is simulated twice with the same noise, moves and times: with friction that falls on all axes, and with
 friction that stays. The difference of the gains is what the warm-up does. *Bare, then loaded* is how it is done step by
-step. *Guided* is the order of a guided session that went on to its seventh block (`daq.jobs.guided`). Both have three
-bare and three loaded blocks in the fit. Layout: out/warm-up-study/<cell>.csv.
+step. *Guided* is the order that cancels drift (`daq.jobs.block_order`), up to the seventh block. Both have three bare
+and three loaded blocks in the fit. Each is fitted with one friction for all blocks, and with `friction_by_load`.
+Layout: out/warm-up-study/<cell>.csv.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.files import replace_file
-from daq.jobs.guided import FIRST_BLOCKS, NEXT_BLOCKS, BlockRole
+from daq.jobs.block_order import FIRST_BLOCKS, NEXT_BLOCKS, BlockRole
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.evidence import gather
 from ident.discovery.loop import find_effects
+from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.direct_cell import MOVING, run_of, simulate_run
 from tests.studies.fingerprint import digest, digest_of_source
@@ -52,6 +54,7 @@ FIRST_PLAN = 5001
 BARE_THEN_LOADED = (BlockRole.BARE,) * 3 + (BlockRole.LOADED,) * 3 + (BlockRole.HELD_OUT,)
 GUIDED = (*FIRST_BLOCKS, *NEXT_BLOCKS)
 ORDERS = {"bare, then loaded": BARE_THEN_LOADED, "guided": GUIDED}
+FRICTIONS = {"one": False, "by load": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +64,13 @@ class Row:
     seed: int
     time_constant_min: float
     order: str
+    friction: str  #: of the model: one for all blocks, or by load
     bent_percent: float  #: largest change of a gain by the warm-up, of the fit without a search
     searched_bent_percent: float  #: the same after the search, whose dictionary has such a friction
     named: tuple[str, ...]  #: what the search found in the cell that warms up
     std_percent: float  #: σ of the worst gain after the search
+    steady_std_percent: float  #: σ of the worst gain of the fit where friction stays
+    error_percent: float  #: largest error of a gain where the friction falls, of the fit without a search
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,23 +123,31 @@ def warm_up(axis: int, minutes: float) -> UndeclaredEffect:
 
 
 def study(unit: WarmingCell) -> tuple[Row, ...]:
-    """Both orders of one cell."""
-    cell = load_cell(CELL)
+    """Both orders of one cell, each by both models of friction."""
+    declared = load_cell(CELL)
     drawn = world_cell(unit.seed, WORLD)
+    truth = np.array([axis.gain_nm_per_a for axis in drawn.bare.axes])
     rows = []
     for order, roles in ORDERS.items():
-        steady = _gains(cell, simulated(drawn, cell, roles, None), roles)
-        warming = _gains(cell, simulated(drawn, cell, roles, unit.time_constant_min), roles)
-        row = Row(
-            seed=unit.seed,
-            time_constant_min=unit.time_constant_min,
-            order=order,
-            bent_percent=_largest_change(steady.fitted, warming.fitted),
-            searched_bent_percent=_largest_change(steady.searched, warming.searched),
-            named=warming.named,
-            std_percent=warming.std_percent,
-        )
-        rows.append(row)
+        steady_runs = simulated(drawn, declared, roles, None)
+        warming_runs = simulated(drawn, declared, roles, unit.time_constant_min)
+        for friction, by_load in FRICTIONS.items():
+            cell = replace(declared, friction_by_load=by_load)
+            steady = _gains(cell, steady_runs, roles)
+            warming = _gains(cell, warming_runs, roles)
+            row = Row(
+                seed=unit.seed,
+                time_constant_min=unit.time_constant_min,
+                order=order,
+                friction=friction,
+                bent_percent=_largest_change(steady.fitted, warming.fitted),
+                searched_bent_percent=_largest_change(steady.searched, warming.searched),
+                named=warming.named,
+                std_percent=warming.std_percent,
+                steady_std_percent=steady.fitted_std_percent,
+                error_percent=_largest_change(truth, warming.fitted),
+            )
+            rows.append(row)
     return tuple(rows)
 
 
@@ -143,6 +157,7 @@ class _Gains:
     searched: FloatArray  #: after it, shape (n,)
     named: tuple[str, ...]
     std_percent: float
+    fitted_std_percent: float  #: of the worst gain, without a search
 
 
 def _gains(cell: Cell, runs: Sequence[Run], roles: Sequence[BlockRole]) -> _Gains:
@@ -155,8 +170,13 @@ def _gains(cell: Cell, runs: Sequence[Run], roles: Sequence[BlockRole]) -> _Gain
         fitted=found.estimate.gains,
         searched=estimate.gains,
         named=tuple(f"{placed.effect.name} on J{placed.axis + 1}" for placed in end.effects),
-        std_percent=float(100.0 * np.max(estimate.gains_std / np.abs(estimate.gains))),
+        std_percent=_worst_std_percent(estimate),
+        fitted_std_percent=_worst_std_percent(found.estimate),
     )
+
+
+def _worst_std_percent(estimate: Estimate) -> float:
+    return float(100.0 * np.max(estimate.gains_std / np.abs(estimate.gains)))
 
 
 def _largest_change(steady: FloatArray, warming: FloatArray) -> float:
@@ -179,29 +199,31 @@ def fingerprint_of(unit: WarmingCell) -> str:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """A line for each time constant: the means over the cells, and their ratio."""
+    """A line for each time constant, order and friction: the means over the cells."""
     lines = [
-        "| time constant, min | cells | bare, then loaded: bent by % | guided: bent by % | ratio | "
-        "after the search: bent by % | guided | ratio |",
+        "| time constant, min | order | friction | cells | bent by % | after the search: bent by % | "
+        "largest error % | σ where friction stays % |",
         "|" + "---|" * 8,
     ]
     constants_min = sorted({row.time_constant_min for row in rows})
-    lines += [_line(f"{one:g}", [row for row in rows if row.time_constant_min == one]) for one in constants_min]
-    if rows:
-        lines.append(_line("all", rows))
+    for order in ORDERS:
+        for friction in FRICTIONS:
+            own = [row for row in rows if (row.order, row.friction) == (order, friction)]
+            by_constant = ([row for row in own if row.time_constant_min == one] for one in constants_min)
+            lines += [_line(f"{of_one[0].time_constant_min:g}", of_one) for of_one in by_constant if of_one]
+            if own:
+                lines.append(_line("all", own))
     return "\n".join(lines)
 
 
 def _line(name: str, rows: Sequence[Row]) -> str:
-    before = [row for row in rows if row.order != "guided"]
-    guided = [row for row in rows if row.order == "guided"]
-    cells = len(guided)
-    plain, plain_guided = (float(np.mean([row.bent_percent for row in part])) for part in (before, guided))
-    found, found_guided = (float(np.mean([row.searched_bent_percent for row in part])) for part in (before, guided))
-    return (
-        f"| {name} | {cells} | {plain:.2f} | {plain_guided:.2f} | {plain_guided / plain:.2f} | "
-        f"{found:.2f} | {found_guided:.2f} | {found_guided / found:.2f} |"
+    first = rows[0]
+    bent, searched, error, std = (
+        float(np.mean([getattr(row, field) for row in rows]))
+        for field in ("bent_percent", "searched_bent_percent", "error_percent", "steady_std_percent")
     )
+    figures = f"{bent:.2f} | {searched:.2f} | {error:.2f} | {std:.2f}"
+    return f"| {name} | {first.order} | {first.friction} | {len(rows)} | {figures} |"
 
 
 def main(arguments: list[str] | None = None) -> int:

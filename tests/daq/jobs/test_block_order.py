@@ -1,0 +1,105 @@
+"""Which block comes next: orders that cancel drift, and orders that need few changes of the payload."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count, pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.jobs.block_order import (
+    CHANGE_S,
+    FIRST_BLOCKS,
+    NEXT_BLOCKS,
+    ROUNDING,
+    BlockRole,
+    BlocksSoFar,
+    fixed_role,
+    quickest_role,
+)
+
+BLOCK_S = 20.0
+AFTER_THREE = BlocksSoFar(bare=1, loaded=1, is_mounted=True)
+
+
+@given(st.integers(0, 50))
+def test_after_each_whole_group_bare_and_loaded_blocks_lie_at_the_same_mean_time(groups: int) -> None:
+    first = len(FIRST_BLOCKS)
+    roles = {number: fixed_role(number) for number in range(first, first + groups * len(NEXT_BLOCKS))}
+    bare = [number for number, role in roles.items() if role is BlockRole.BARE]
+    loaded = [number for number, role in roles.items() if role is BlockRole.LOADED]
+    assert len(bare) == len(loaded)
+    assert sum(bare) == sum(loaded)
+
+
+@given(st.integers(0, 200))
+def test_the_payload_changes_at_most_every_second_block_after_the_first(number: int) -> None:
+    """Mounting is the work of the person; the first three blocks need one change."""
+    roles = [fixed_role(one) for one in range(number + 1)]
+    loads = [role is not BlockRole.BARE for role in roles]
+    changes = sum(one != other for one, other in pairwise(loads))
+    assert changes <= 1 + len(roles) // 2
+    assert roles.count(BlockRole.HELD_OUT) == (number >= 2)
+
+
+def _variance(blocks: BlocksSoFar) -> float:
+    return 1.0 / blocks.bare + 1.0 / blocks.loaded
+
+
+def _with_one_more(blocks: BlocksSoFar, role: BlockRole) -> BlocksSoFar:
+    if role is BlockRole.BARE:
+        return replace(blocks, bare=blocks.bare + 1, is_mounted=False)
+    return replace(blocks, loaded=blocks.loaded + 1, is_mounted=True)
+
+
+def _recorded(first_ratio: float) -> list[BlocksSoFar]:
+    """Blocks of a session after the first three, until σ of the worst gain is at its target."""
+    target = _variance(AFTER_THREE) / first_ratio
+    steps = [AFTER_THREE]
+    while _variance(steps[-1]) > target * (1.0 + ROUNDING):
+        role = quickest_role(steps[-1], _variance(steps[-1]) / target, BLOCK_S)
+        steps.append(_with_one_more(steps[-1], role))
+    return steps
+
+
+def _time_s(steps: list[BlocksSoFar]) -> float:
+    changes = sum(one.is_mounted != other.is_mounted for one, other in pairwise(steps))
+    return BLOCK_S * (len(steps) - 1) + CHANGE_S * changes
+
+
+@given(st.floats(1.01, 40.0))
+def test_a_session_needs_at_most_one_more_change(first_ratio: float) -> None:
+    steps = _recorded(first_ratio)
+    assert sum(one.is_mounted != other.is_mounted for one, other in pairwise(steps)) <= 1
+
+
+@given(st.floats(1.01, 40.0))
+def test_no_order_is_quicker(first_ratio: float) -> None:
+    """Beside every number of bare and of loaded blocks that is enough."""
+    target = _variance(AFTER_THREE) / first_ratio
+    found_s = _time_s(_recorded(first_ratio))
+    for bare in range(1, 90):
+        loaded = next(
+            (one for one in range(1, 2000) if _variance(replace(AFTER_THREE, bare=bare, loaded=one)) <= target), None
+        )
+        if loaded is not None:
+            others_s = BLOCK_S * (bare + loaded - 2) + (CHANGE_S if bare > 1 else 0.0)
+            assert found_s <= others_s + 1e-9
+
+
+@pytest.mark.parametrize("ratio", [2.5, 4.0, 9.0])
+def test_it_is_quicker_than_the_order_that_cancels_drift(ratio: float) -> None:
+    target = _variance(AFTER_THREE) / ratio
+    steps = [AFTER_THREE]
+    for number in count(len(FIRST_BLOCKS)):
+        if _variance(steps[-1]) <= target:
+            break
+        steps.append(_with_one_more(steps[-1], fixed_role(number)))
+    assert _time_s(_recorded(ratio)) < 0.8 * _time_s(steps)
+
+
+def test_a_target_that_is_far_away_still_has_a_next_block() -> None:
+    assert quickest_role(AFTER_THREE, 1e6, BLOCK_S) is BlockRole.LOADED
+    assert quickest_role(BlocksSoFar(3, 200, is_mounted=True), 1e6, BLOCK_S) is BlockRole.BARE
