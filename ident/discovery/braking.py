@@ -12,11 +12,17 @@ and may be below zero by no more than SIGMAS of its own σ. At rest, f is what t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
+from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
+from ident.effects.effect import PlacedEffect
 from ident.effects.friction import SpeedFriction
+from ident.model.bodies import LOADED
 
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
 """Shares of the largest speed; the first one stands for the limit at rest."""
@@ -29,48 +35,76 @@ def pushing(evidence: Evidence, axis: int) -> str:
         evidence: a joint fit.
         axis: index of the axis.
     """
-    estimate = evidence.estimate
     placed = [one for one in evidence.effects if one.axis == axis and isinstance(one.effect, SpeedFriction)]
-    declared = _declared_places(evidence, axis)
-    if not placed or declared is None:
+    if not placed:
         return ""
     fastest = max(float(np.max(np.abs(data.velocity_rad_s[:, axis]))) for data in evidence.fit_runs)
+    found: list[_Friction] = []
+    for declared in _declared_friction(evidence, axis):
+        for direction in (1.0, -1.0):
+            found += _friction_at(evidence, declared, placed, direction * fastest * SPEEDS)
+    worst = min(found, key=lambda one: one.torque + SIGMAS * one.std, default=None)
+    if worst is None or worst.torque + SIGMAS * worst.std >= 0.0:
+        return ""
+    rate = "m/s" if worst.unit == "N" else "rad/s"
+    is_at_rest = abs(worst.speed) < 2.0 * fastest * SPEEDS[0]
+    where = "at rest" if is_at_rest else f"at {worst.speed:.2g} {rate}"
+    return f"the friction of this axis would push the arm {where} ({worst.torque:.3g} ± {worst.std:.2g} {worst.unit})"
+
+
+@dataclass(frozen=True, slots=True)
+class _Declared:
+    """Dry and viscous friction of an axis, as places among the parameters: without load, or the sums with it."""
+
+    dry: tuple[int, ...]
+    viscous: tuple[int, ...]
+    unit: str  #: of the dry friction
+
+
+@dataclass(frozen=True, slots=True)
+class _Friction:
+    """Friction of an axis at one speed; positive where it brakes."""
+
+    speed: float  #: [rad/s or m/s]
+    torque: float  #: [unit]
+    std: float  #: [unit]
+    unit: str
+
+
+def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
+    """The declared friction of an axis without load, and with it where that is another one.
+
+    Empty where a part of it is regrouped into other parameters.
+    """
+    model = evidence.model
+    places = {column.name.split(" ", 1)[0]: place for place, column in enumerate(evidence.estimate.unknowns)}
+    dry = model.columns[model.dry_friction_columns[axis]]
+    viscous = model.columns[model.viscous_friction_columns[axis]].name
+    if dry.name not in places or viscous not in places:
+        return []
+    bare = _Declared((places[dry.name],), (places[viscous],), dry.unit)
+    more_dry = places.get(f"{dry.name}{LOADED}")
+    more_viscous = places.get(f"{viscous}{LOADED}")
+    if more_dry is None or more_viscous is None:
+        return [bare]
+    return [bare, _Declared((*bare.dry, more_dry), (*bare.viscous, more_viscous), dry.unit)]
+
+
+def _friction_at(
+    evidence: Evidence, declared: _Declared, placed: Sequence[PlacedEffect], velocity: FloatArray
+) -> list[_Friction]:
+    """Friction at velocities of one sign, shape (k,)."""
+    estimate = evidence.estimate
     values = np.concatenate((estimate.gains, estimate.parameters))
-    count = len(estimate.gains)
-    worst = ""
-    lowest = 0.0
-    for sign in (1.0, -1.0):
-        speed = fastest * SPEEDS
-        weights = np.zeros((len(speed), len(values)))
-        weights[:, count + declared[0]] = 1.0
-        weights[:, count + declared[1]] = speed
-        for one in placed:
-            assert isinstance(one.effect, SpeedFriction)
-            columns = sign * one.effect.at_speed(sign * speed)
-            weights[:, count + own_unknowns(estimate, (one,))] = columns.T
-        friction = weights @ values
-        std = np.sqrt(np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights))
-        excess = friction + SIGMAS * std
-        place = int(np.argmin(excess))
-        if excess[place] < lowest:
-            lowest = float(excess[place])
-            worst = _text(evidence, declared[0], sign * float(speed[place]), float(friction[place]), float(std[place]))
-    return worst
-
-
-def _declared_places(evidence: Evidence, axis: int) -> tuple[int, int] | None:
-    """Places of fs and fv of an axis among the parameters; None where one of them is regrouped into others."""
-    leading = [column.name.split(" ", 1)[0] for column in evidence.estimate.unknowns]
-    columns = evidence.model.columns
-    dry = columns[evidence.model.dry_friction_columns[axis]].name
-    viscous = columns[evidence.model.viscous_friction_columns[axis]].name
-    if dry not in leading or viscous not in leading:
-        return None
-    return leading.index(dry), leading.index(viscous)
-
-
-def _text(evidence: Evidence, dry: int, speed: float, friction: float, std: float) -> str:
-    unit = evidence.estimate.unknowns[dry].unit
-    rate = "m/s" if unit == "N" else "rad/s"
-    at = "at rest" if abs(speed) < 1e-5 else f"at {speed:.2g} {rate}"
-    return f"the friction of this axis would push the arm {at} ({friction:.3g} ± {std:.2g} {unit})"
+    first = len(estimate.gains)
+    weights = np.zeros((len(velocity), len(values)))
+    weights[:, first + np.array(declared.dry)] = 1.0
+    weights[:, first + np.array(declared.viscous)] = np.abs(velocity)[:, None]
+    for one in placed:
+        if isinstance(one.effect, SpeedFriction):
+            against_motion = np.sign(velocity) * one.effect.at_speed(velocity)
+            weights[:, first + own_unknowns(estimate, (one,))] = against_motion.T
+    torque = weights @ values
+    std = np.sqrt(np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights))
+    at_each = zip(velocity.tolist(), torque.tolist(), std.tolist(), strict=True)
+    return [_Friction(speed, friction, sigma, declared.unit) for speed, friction, sigma in at_each]

@@ -109,3 +109,20 @@ def test_columns_are_the_torque_at_the_speed_of_the_joint(effect: SpeedFriction)
     assert columns.shape == (len(effect.coefficients), len(velocity))
     is_even = isinstance(effect, AsymmetricViscous)
     np.testing.assert_allclose(columns, effect.at_speed(-velocity) * (1.0 if is_even else -1.0), atol=1e-12)
+
+
+def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
+    """Without load the axis brakes; with it, what the payload adds to the friction is more than there was."""
+    by_load = replace(truth, model=replace(truth.model, friction_by_load=True))
+    rng = np.random.default_rng(12)
+    runs = [
+        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0)
+        for number, payload in enumerate((None, MOUNTED))
+    ]
+    fitted = with_effects(gathered(by_load, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))
+    assert pushing(fitted, AXIS) == ""
+    names = [column.name for column in fitted.estimate.unknowns]
+    parameters = fitted.estimate.parameters.copy()
+    parameters[names.index("fs2_loaded")] -= 30.0
+    lighter = replace(fitted, estimate=replace(fitted.estimate, parameters=parameters))
+    assert "would push the arm" in pushing(lighter, AXIS)
