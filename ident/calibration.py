@@ -59,7 +59,8 @@ class Parameter:
     @property
     def is_of_load(self) -> bool:
         """Whether it is, or leads with, what a payload adds to friction (`Model.friction_by_load`)."""
-        return self.name.split(" ", 1)[0].endswith(LOADED)
+        is_of_robot = ":" not in self.name  # behind a colon is the mounting of a payload
+        return is_of_robot and self.name.split(" ", 1)[0].endswith(LOADED)
 
     @property
     def std_percent(self) -> float:

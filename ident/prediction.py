@@ -68,7 +68,9 @@ def fitted_model(calibration: Calibration, model: Model) -> Model:
         EffectRefused: it holds an effect that does not exist.
     """
     model = corrected_model(model, corrections_of(calibration))
-    return replace(model, friction_by_load=True) if calibration.friction_by_load else model
+    # A new model would follow the motions of closed chains again.
+    is_lacking = calibration.friction_by_load and not model.friction_by_load
+    return replace(model, friction_by_load=True) if is_lacking else model
 
 
 def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:

@@ -222,8 +222,13 @@ def rows_to_weigh(
 def _rows_of(model: Model, datasets: tuple[Dataset, ...], bare: int, conditioning: Conditioning) -> RowsToWeigh:
     """Build the rows of runs, those without the body first."""
     rows = observe(model, datasets, conditioning, standard_equations(model))
+    is_mounted = rows.run >= bare
+    if model.friction_by_load:
+        # What the runs say of their payload is ignored, but their friction is that of a loaded arm.
+        friction = rows.regressor[:, model.friction_columns] * is_mounted
+        rows.regressor[:, model.loaded_friction_columns] = friction
     body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
-    rows = rows.extended(body, rows.flange * (rows.run >= bare))
+    rows = rows.extended(body, rows.flange * is_mounted)
     return RowsToWeigh(model, datasets, bare, rows)
 
 
@@ -247,16 +252,15 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     depends = not all(placed.effect.abscissa.is_independent_of_model for placed, _ in effects)
     without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
 
-    def signals(datasets: Sequence[Dataset], body: FloatArray) -> list[Signals]:
-        whole = standard.copy()
-        whole[model.flange] += body
+    def signals(datasets: Sequence[Dataset], body: FloatArray | None) -> list[Signals]:
+        whole = model.mounted(standard, body)
         began_s = calibration.session_began_s
         if not effects:
             return []
         placed = [effect for effect, _ in effects]
         return [beside_rotors(declared_signals(model, data, whole, gains, began_s), placed) for data in datasets]
 
-    bare, body = signals(without, np.zeros(10)), np.zeros(10)
+    bare, body = signals(without, None), np.zeros(10)
     for _ in range(MAX_PASSES if depends else 1):
         rows, runs = given.rows, (*bare, *signals(mounted, body))
         for placed, _ in effects:
@@ -382,7 +386,7 @@ def moves_that_help(weighed: WeighedBody, extras: Sequence[ExtraMoves]) -> tuple
 
 def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
     """JᵀJ of moves with the body, and of the same without load where the robot is unknown too."""
-    columns = scale.model.regressor(extra.excitation.motion)
+    columns = scale.model.regressor(extra.excitation.motion, loaded=True)
     count = columns.shape[1]
     columns = np.concatenate((columns, columns[:, scale.model.flange]), axis=1)
     motors = np.tensordot(scale.model.drive_train.to_motor * scale.weight[:, None], columns, axes=1)
@@ -392,7 +396,8 @@ def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
     rows[:, inside] = motors[:, scale.unknowns[inside]].transpose(0, 2, 1).reshape(len(rows), -1)
     information = rows.T @ rows
     if scale.beside_bare_runs:
-        rows[:, scale.unknowns >= count] = 0.0
+        of_body = (scale.unknowns >= count) | np.isin(scale.unknowns, scale.model.loaded_friction_columns)
+        rows[:, of_body] = 0.0
         information += rows.T @ rows
     return information
 

@@ -14,7 +14,7 @@ from daq.config.cell import Cell
 from daq.documents.calibration_file import load_calibration
 from daq.documents.session_state import GuidedState, Outcome
 from daq.errors import DaqError, ExitCode
-from daq.jobs.guided import left_s
+from daq.jobs.guided import motion_left_s
 from daq.jobs.position import position_of, sessions_folder
 from daq.jobs.reporting import Conclusion, to_do
 from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
@@ -159,7 +159,7 @@ class Results:
             "acceptance": None,
         }
         if state.progress and state.gains:
-            found["precision"] = _precision(state)
+            found["precision"] = _precision(self._cell, state)
         if state.acceptance is not None:
             found["acceptance"] = {"accepted": state.acceptance.accepted, "remark": state.acceptance.remark}
         return found
@@ -185,14 +185,16 @@ class Results:
         }
 
 
-def _precision(state: GuidedState) -> dict[str, Any]:
+def _precision(cell: Cell, state: GuidedState) -> dict[str, Any]:
     """Return σ of each gain after each judged block, its target, the motion that is left, and why it is."""
     worst = max(state.gains, key=lambda gain: gain.std_percent / gain.target_percent)
+    last = state.progress[-1]
+    judged = state.blocks[: last.blocks]
     return {
         "axes": [gain.axis for gain in state.gains],
         "target_percent": state.gains[0].target_percent,
         "progress": [one.model_dump(mode="json") for one in state.progress],
         "worst": worst.axis,
         "why": worst.cause,
-        "left_s": left_s(state.gains, state.progress[-1].fitted_s),
+        "left_s": motion_left_s(cell, state.gains, judged, last.motion_s / last.blocks),
     }

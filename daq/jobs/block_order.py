@@ -8,11 +8,13 @@ same for both.
 
 With `friction_by_load`, a change of friction between bare and loaded blocks is no gain, in whatever order they come. So
 the order is the one that takes a person the least time, and a change of the payload takes minutes. Of n bare and k
-loaded blocks, σ² of a gain falls as 1/n + 1/k: gains are seen by the difference of the two.
+loaded blocks, σ² of a gain falls as 1/n + 1/k: gains are seen by the difference of the two. Where the time of the
+session is too short for the target, the order is the one that leaves σ smallest at its end.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -29,7 +31,7 @@ FIRST_BLOCKS = (BlockRole.BARE, BlockRole.LOADED, BlockRole.HELD_OUT)
 NEXT_BLOCKS = (BlockRole.LOADED, BlockRole.BARE, BlockRole.BARE, BlockRole.LOADED)
 CHANGE_S = 180.0  #: Time of a person to change the payload [s]
 ROUNDING = 1e-9  #: Relative
-MOST_BLOCKS = 60  #: Of one kind, in a look ahead
+FAR = 4000  #: Blocks that no session has
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,32 +50,55 @@ def fixed_role(number: int) -> BlockRole:
     return NEXT_BLOCKS[(number - len(FIRST_BLOCKS)) % len(NEXT_BLOCKS)]
 
 
-def quickest_role(so_far: BlocksSoFar, variance_ratio: float, block_s: float) -> BlockRole:
-    """Return the role with which the least time of a person is left until every gain is precise.
+@dataclass(frozen=True, slots=True)
+class BlocksToCome:
+    """Further blocks of the fit."""
+
+    bare: int
+    loaded: int
+
+    @property
+    def count(self) -> int:
+        """Number of them."""
+        return self.bare + self.loaded
+
+
+def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, most: int = FAR) -> BlocksToCome:
+    """Return the further blocks with which every gain is precise in the least time of a person.
+
+    Where they are more than there is time for, it is the blocks of that time that leave σ smallest.
 
     Args:
         so_far: at least one block of each kind.
-        variance_ratio: σ² of the worst gain over that of its target.
+        variance_ratio: σ² of the worst gain over that of its target, above one.
         block_s: duration of a block [s].
+        most: number of blocks until the recording ends, at least one.
     """
-    bare = so_far.bare
-    loaded = so_far.loaded
-    wanted = (1.0 / bare + 1.0 / loaded) / variance_ratio * (1.0 + ROUNDING)
-    kept = BlockRole.LOADED if so_far.is_mounted else BlockRole.BARE
-    changed = BlockRole.BARE if so_far.is_mounted else BlockRole.LOADED
-    least_s = float("inf")
-    # Where no look ahead is long enough, the kind with fewer blocks helps most.
-    best = BlockRole.LOADED if loaded < bare or (loaded == bare and so_far.is_mounted) else BlockRole.BARE
-    for more_bare in range(MOST_BLOCKS + 1):
-        for more_loaded in range(MOST_BLOCKS + 1):
-            is_enough = 1.0 / (bare + more_bare) + 1.0 / (loaded + more_loaded) <= wanted
-            if not is_enough or more_bare + more_loaded == 0:
-                continue
-            more_kept = more_loaded if so_far.is_mounted else more_bare
-            needs_change = more_bare + more_loaded > more_kept
-            time_s = block_s * (more_bare + more_loaded) + (CHANGE_S if needs_change else 0.0)
-            if time_s < least_s:
-                least_s = time_s
-                best = kept if more_kept else changed
-            break  # with more loaded blocks it takes longer
-    return best
+    wanted = (1.0 / so_far.bare + 1.0 / so_far.loaded) / variance_ratio * (1.0 + ROUNDING)
+    enough = [way for bare in range(most + 1) if (way := _with_bare(so_far, bare, wanted)) is not None]
+    in_time = [way for way in enough if 1 <= way.count <= most]
+    if in_time:
+        return min(in_time, key=lambda way: _time_s(so_far, way, block_s))
+    ways = [BlocksToCome(bare, most - bare) for bare in range(most + 1)]
+    return min(ways, key=lambda way: 1.0 / (so_far.bare + way.bare) + 1.0 / (so_far.loaded + way.loaded))
+
+
+def next_role(so_far: BlocksSoFar, way: BlocksToCome) -> BlockRole:
+    """Return the role of the next block: the payload stays as it is while that is of use."""
+    if so_far.is_mounted:
+        return BlockRole.LOADED if way.loaded else BlockRole.BARE
+    return BlockRole.BARE if way.bare else BlockRole.LOADED
+
+
+def _with_bare(so_far: BlocksSoFar, bare: int, wanted: float) -> BlocksToCome | None:
+    """The fewest loaded blocks that are enough beside so many bare ones; None where no number is."""
+    left = wanted - 1.0 / (so_far.bare + bare)
+    if left <= 0.0:
+        return None
+    return BlocksToCome(bare, max(0, math.ceil(1.0 / left - ROUNDING) - so_far.loaded))
+
+
+def _time_s(so_far: BlocksSoFar, way: BlocksToCome, block_s: float) -> float:
+    """Time of a person for further blocks [s]."""
+    others = way.bare if so_far.is_mounted else way.loaded
+    return block_s * way.count + (CHANGE_S if others else 0.0)

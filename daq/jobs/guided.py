@@ -18,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.policy import DEFAULT_TARGET_SIGMA_PERCENT
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
 from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, writing
 from daq.jobs.block_check import compared_with, mistake_in
-from daq.jobs.block_order import FIRST_BLOCKS, BlockRole, BlocksSoFar, fixed_role, quickest_role
+from daq.jobs.block_order import FIRST_BLOCKS, BlockRole, BlocksSoFar, fixed_role, next_role, quickest_way
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, move_without_log
@@ -150,10 +151,12 @@ class UntilPrecise:
         is_free = number >= len(FIRST_BLOCKS) and context.cell.friction_by_load and bool(gains)
         if not is_free:
             return fixed_role(number)
-        loads = [block.payload is not None for block in state.blocks if not block.holdout]
-        so_far = BlocksSoFar(loads.count(False), loads.count(True), is_mounted=state.blocks[-1].payload is not None)
-        variance_ratio = max((gain.std_percent / gain.target_percent) ** 2 for gain in gains)
-        return quickest_role(so_far, variance_ratio, self.settings.block_s)
+        mounted = {block.name: block.payload is not None for block in state.blocks}
+        recorded = [run.name for run in state.runs if run.name in mounted]
+        so_far = blocks_so_far(state.blocks, is_mounted=mounted[recorded[-1]])
+        left_s = 60.0 * self.settings.time_limit_min - self.settings.block_s * len(state.blocks)
+        most = max(1, math.floor(left_s / self.settings.block_s))
+        return next_role(so_far, quickest_way(so_far, _variance_ratio(gains), self.settings.block_s, most))
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
@@ -218,7 +221,7 @@ class UntilPrecise:
                 gains=[gain.model_dump() for gain in gains],
                 blocks=recorded,
                 motion_s=motion_s,
-                left_s=left_s(gains, fitted_s),
+                left_s=motion_left_s(context.cell, gains, state.blocks, self.settings.block_s),
             )
         has_held_out = any(block.holdout for block in state.blocks)
         is_precise = bool(gains) and all(gain.is_precise for gain in gains) and has_held_out
@@ -227,7 +230,8 @@ class UntilPrecise:
         would_help: tuple[str, ...] = ()
         if is_time_up and not is_precise:
             missing = _missing(gains, self.settings.time_limit_min)
-            would_help = _would_help(estimate, motion_s, fitted_s)
+            left_s = motion_left_s(context.cell, gains, state.blocks, self.settings.block_s)
+            would_help = _would_help(estimate, motion_s + left_s)
             context.journal.say(Level.NOTICE, "time is up", missing=missing, would_help=would_help)
         elif not is_precise:
             self._plan_next(context, session, estimate)
@@ -444,18 +448,40 @@ def require_same_cell(context: SessionContext) -> None:
         )
 
 
-def left_s(gains: Sequence[GainSoFar], motion_s: float) -> float:
-    """Return the motion that is left until every gain is at its target, if σ falls as 1/√time [s]; 0 without gains.
+def motion_left_s(cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block], block_s: float) -> float:
+    """Return the motion that is left until every gain is at its target [s]; 0 where it is, or nothing is known.
 
     Args:
+        cell: with its model of friction, which the order of the blocks depends on.
         gains: so far.
-        motion_s: motion behind them [s].
+        blocks: behind them.
+        block_s: duration of a block [s].
     """
     if not gains:
         return 0.0
-    std_percent = np.array([gain.std_percent for gain in gains])
-    target_percent = np.array([gain.target_percent for gain in gains])
-    return time_to_target(std_percent, target_percent, motion_s).longest_s
+    if not cell.friction_by_load:
+        fitted_s = block_s * sum(not block.holdout for block in blocks)
+        std_percent = np.array([gain.std_percent for gain in gains])
+        target_percent = np.array([gain.target_percent for gain in gains])
+        return time_to_target(std_percent, target_percent, fitted_s).longest_s
+    ratio = _variance_ratio(gains)
+    if ratio <= 1.0:
+        return 0.0
+    if not math.isfinite(ratio):
+        return math.inf
+    so_far = blocks_so_far(blocks, is_mounted=blocks[-1].payload is not None)
+    return block_s * quickest_way(so_far, ratio, block_s).count
+
+
+def blocks_so_far(blocks: Sequence[Block], *, is_mounted: bool) -> BlocksSoFar:
+    """Count the blocks of the fit."""
+    loads = [block.payload is not None for block in blocks if not block.holdout]
+    return BlocksSoFar(loads.count(False), loads.count(True), is_mounted=is_mounted)
+
+
+def _variance_ratio(gains: Sequence[GainSoFar]) -> float:
+    """σ² of the worst gain over that of its target."""
+    return max((gain.std_percent / gain.target_percent) ** 2 for gain in gains)
 
 
 def gains_so_far(context: SessionContext, estimate: Estimate, target_percent: float) -> tuple[GainSoFar, ...]:
@@ -508,11 +534,16 @@ def _missing(gains: tuple[GainSoFar, ...], minutes: float) -> str:
     return f"σ after {minutes:g} min of motion: {listed}; the target is {coarse[0].target_percent:g} %"
 
 
-def _would_help(estimate: BlockEstimate, motion_s: float, fitted_s: float) -> tuple[str, ...]:
-    """Say what would help to reach the target: more time, and for each axis what its slowness comes from."""
+def _would_help(estimate: BlockEstimate, needed_s: float) -> tuple[str, ...]:
+    """Say what would help to reach the target: more time, and for each axis what its slowness comes from.
+
+    Args:
+        estimate: of the blocks so far.
+        needed_s: motion of the whole session until every gain is at its target [s].
+    """
     if not estimate.gains:
         return ("see above why the gains are not known; correct that, and record again",)
-    needed_min = math.ceil((motion_s + left_s(estimate.gains, fitted_s)) / 60.0)
+    needed_min = math.ceil(needed_s / 60.0)
     found = [f"more time: about {needed_min} min of motion in all at this rate (--time-limit {needed_min})"]
     if estimate.outlook is None:
         return tuple(found)

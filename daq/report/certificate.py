@@ -536,8 +536,9 @@ def order_text(calibration: Calibration) -> str:
     if not loaded_places or not bare_places:
         return ""
     listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
-    if calibration.friction_by_load:
-        return f"{listed}; fitted with friction by load, so a warm-up moves no gain"
+    by_load = [parameter for parameter in calibration.parameters if parameter.is_of_load]
+    if sum(parameter.name.startswith("fs") for parameter in by_load) >= len(calibration.gains):
+        return f"{listed}; friction by load: its change between them moves no gain"
     later = fmean(loaded_places) - fmean(bare_places)
     if abs(later) <= BALANCED_PLACES:
         return f"{listed}; so an even warm-up moves no gain"

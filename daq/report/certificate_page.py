@@ -392,8 +392,8 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
         paragraph(
             "The number is that of the axis. I: moment of inertia of the link (Ia: of the motor), m: its mass, mx, my, "
             "mz: mass × centre of mass, fv: viscous friction, fs: dry friction, off: constant torque, m in the middle "
-            "of a name (Iam, fvm, fsm): coupled motors. A sum is what motion shows of several links together; a name "
-            "after a colon is a payload."
+            "of a name (Iam, fvm, fsm): coupled motors, _loaded at its end: what is added while a payload is mounted. "
+            "A sum is what motion shows of several links together; a name after a colon is a payload."
         ),
         table("", ("parameter", "value ± σ", "unit"), value_rows(parameters), "stacked"),
     )

@@ -14,6 +14,7 @@ from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from daq.workflow.validate import CORRECTIONS
 from ident.calibration import Calibration
+from ident.model.bodies import LOADED
 from ident.physical.physical import MARGIN
 
 _SHOWN_SHIFTS = 5
@@ -157,7 +158,7 @@ def urdf_report(
         not_in_urdf=[
             NotInUrdf.of(column, value=value)
             for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
-            if column.name.startswith(("Ia", "off", "fvm", "fsm"))
+            if column.name.startswith(("Ia", "off", "fvm", "fsm")) and not column.name.endswith(LOADED)
         ],
         effects_left_out=[f"{effect.name} on {effect.axis}" for effect in calibration.effects],
     )

@@ -8,6 +8,8 @@ it was off by 5 %. So dry and viscous friction are judged together with all effe
     f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs, in both directions,
 
 and may be below zero by no more than SIGMAS of its own σ. At rest, f is what the friction of the axis begins with.
+Friction by load, position or distance brakes too and is left out. An axis whose friction depends on the temperature is
+not judged: fs and fv are then those of a temperature that the runs need not have.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import SpeedFriction
+from ident.effects.signals import Abscissa
 from ident.model.bodies import LOADED
 
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
@@ -36,7 +39,8 @@ def pushing(evidence: Evidence, axis: int) -> str:
         axis: index of the axis.
     """
     placed = [one for one in evidence.effects if one.axis == axis and isinstance(one.effect, SpeedFriction)]
-    if not placed:
+    by_temperature = any(one.axis == axis and one.effect.abscissa is Abscissa.TEMPERATURE for one in evidence.effects)
+    if not placed or by_temperature:
         return ""
     fastest = max(float(np.max(np.abs(data.velocity_rad_s[:, axis]))) for data in evidence.fit_runs)
     found: list[_Friction] = []

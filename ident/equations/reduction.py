@@ -439,7 +439,19 @@ def shown_base(standard: System) -> BaseParameters:
             found = f"{name} never moves above its standstill speed in any run"
             raise JointStill(", ".join(standard.runs), (name,), found)
     names = tuple(column.name for column in standard.columns)
-    return base_parameters(_linear_columns(standard)[:, : len(names)], names)
+    columns = _linear_columns(standard)[:, : len(names)]
+    _leave_out_friction_without_bare_rows(standard.model, columns)
+    return base_parameters(columns, names)
+
+
+def _leave_out_friction_without_bare_rows(model: Model, columns: FloatArray) -> None:
+    """Clear what a payload adds to a friction that no bare row shows: the two are one parameter then."""
+    if not model.friction_by_load:
+        return
+    for declared, added in zip(model.friction_columns, model.loaded_friction_columns, strict=True):
+        apart = np.linalg.norm(columns[:, declared] - columns[:, added])
+        if apart <= SMALLEST_COLUMN * np.linalg.norm(columns[:, declared]):
+            columns[:, added] = 0.0
 
 
 def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:

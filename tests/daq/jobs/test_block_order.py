@@ -17,7 +17,8 @@ from daq.jobs.block_order import (
     BlockRole,
     BlocksSoFar,
     fixed_role,
-    quickest_role,
+    next_role,
+    quickest_way,
 )
 
 BLOCK_S = 20.0
@@ -59,7 +60,8 @@ def _recorded(first_ratio: float) -> list[BlocksSoFar]:
     target = _variance(AFTER_THREE) / first_ratio
     steps = [AFTER_THREE]
     while _variance(steps[-1]) > target * (1.0 + ROUNDING):
-        role = quickest_role(steps[-1], _variance(steps[-1]) / target, BLOCK_S)
+        way = quickest_way(steps[-1], _variance(steps[-1]) / target, BLOCK_S)
+        role = next_role(steps[-1], way)
         steps.append(_with_one_more(steps[-1], role))
     return steps
 
@@ -100,6 +102,35 @@ def test_it_is_quicker_than_the_order_that_cancels_drift(ratio: float) -> None:
     assert _time_s(_recorded(ratio)) < 0.8 * _time_s(steps)
 
 
-def test_a_target_that_is_far_away_still_has_a_next_block() -> None:
-    assert quickest_role(AFTER_THREE, 1e6, BLOCK_S) is BlockRole.LOADED
-    assert quickest_role(BlocksSoFar(3, 200, is_mounted=True), 1e6, BLOCK_S) is BlockRole.BARE
+def _until_limit(first_ratio: float, blocks: int, *, is_fixed: bool) -> tuple[float, int]:
+    """σ² over that of the target after so many further blocks, or less, and the changes of the payload."""
+    target = _variance(AFTER_THREE) / first_ratio
+    steps = [AFTER_THREE]
+    for number in range(blocks):
+        ratio = _variance(steps[-1]) / target
+        if ratio <= 1.0 + ROUNDING:
+            break
+        role = fixed_role(len(FIRST_BLOCKS) + number)
+        if not is_fixed:
+            role = next_role(steps[-1], quickest_way(steps[-1], ratio, BLOCK_S, blocks - number))
+        steps.append(_with_one_more(steps[-1], role))
+    changes = sum(one.is_mounted != other.is_mounted for one, other in pairwise(steps))
+    return _variance(steps[-1]) / target, changes
+
+
+@given(st.floats(1.01, 100.0), st.integers(1, 90))
+def test_at_the_time_limit_sigma_is_no_larger_than_in_the_order_that_cancels_drift(
+    first_ratio: float, blocks: int
+) -> None:
+    ratio, changes = _until_limit(first_ratio, blocks, is_fixed=False)
+    fixed_ratio, _ = _until_limit(first_ratio, blocks, is_fixed=True)
+    assert ratio <= max(fixed_ratio, 1.0) * (1.0 + 1e-6)
+    assert changes <= 1
+
+
+@given(st.floats(1.01, 40.0))
+def test_what_is_left_shrinks_by_each_block(first_ratio: float) -> None:
+    steps = _recorded(first_ratio)
+    target = _variance(AFTER_THREE) / first_ratio
+    left = [quickest_way(one, _variance(one) / target, BLOCK_S).count for one in steps[:-1]]
+    assert left == list(range(len(steps) - 1, 0, -1))

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from daq.config.cell_file import load_cell
 from daq.console.results import Results
 from daq.documents.session_state import (
     Acceptance,
@@ -21,7 +22,8 @@ from daq.documents.session_state import (
     Outcome,
     RecordedRun,
 )
-from daq.jobs.guided import left_s
+from daq.environment import shipped_configurations
+from daq.jobs.guided import motion_left_s
 from daq.jobs.journal import Form, Level
 from daq.jobs.position import StageName, goes_on_with, position_of
 from daq.jobs.session import Session, save
@@ -98,8 +100,18 @@ def test_at_the_time_limit_it_is_said_what_would_help() -> None:
 def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
     """σ twice the target needs four times the motion, three times of it still to come."""
     gains = [GainSoFar.model_validate(gain) for gain in GAINS]
-    assert left_s(gains, 60.0) == pytest.approx(180.0)
-    assert left_s(gains[:1], 60.0) == 0.0
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    blocks = [
+        Block(name=f"block-{number}-{kind}", payload=payload, mass_kg=None, holdout=kind == "held-out", plan="")
+        for number, (kind, payload) in enumerate([("bare", None), ("loaded", "disc"), ("held-out", "disc")], 1)
+    ]
+    assert motion_left_s(cell, gains, blocks, 30.0) == pytest.approx(180.0)
+    assert motion_left_s(cell, gains[:1], blocks, 30.0) == 0.0
+    # Three more blocks of each kind, as friction by load needs no order.
+    by_load = replace(cell, friction_by_load=True)
+    assert motion_left_s(by_load, gains, blocks, 30.0) == pytest.approx(180.0)
+    assert motion_left_s(by_load, gains[:1], blocks, 30.0) == 0.0
+    assert motion_left_s(by_load, [], blocks, 30.0) == 0.0
 
 
 def test_a_warning_is_said_once_and_what_is_for_programs_never() -> None:

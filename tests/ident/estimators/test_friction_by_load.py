@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.calibration import Calibration, calibration_of
+from ident.calibration import Calibration, Parameter, calibration_of
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify
+from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.prediction import fitted_model, predict_torque, standard_parameters
+from ident.weighing import weigh
 from tests.ident.recordings import MOUNTED, PAYLOAD_TRUTH, Truth, record, three_axes_truth, tx40_truth
 
 FloatArray = NDArray[np.float64]
@@ -146,3 +148,38 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
         np.testing.assert_allclose(
             model.torques(motion, model.mounted(parameters, mounted))[2], by_columns, rtol=1e-9, atol=1e-9
         )
+
+
+def test_where_every_run_is_loaded_there_is_one_friction(truth: Truth) -> None:
+    rng = np.random.default_rng(10)
+    disc = Payload("disc", "a", dict(PAYLOAD_TRUTH))
+    plate = Payload("plate", "b", {name: 0.5 * value for name, value in PAYLOAD_TRUTH.items()})
+    runs = [
+        record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0)
+        for number, payload in enumerate((disc, plate))
+    ]
+    by_load = replace(truth.model, friction_by_load=True)
+    gains = truth.gains
+    shared = identify(truth.model, runs, CONDITIONING, fixed_gains=gains, judge=False)
+    found = identify(by_load, runs, CONDITIONING, fixed_gains=gains, judge=False)
+    assert found.estimate.unknowns == shared.estimate.unknowns
+    np.testing.assert_allclose(found.estimate.parameters, shared.estimate.parameters, rtol=1e-9, atol=1e-9)
+
+
+def test_a_mounting_of_any_name_is_no_friction() -> None:
+    assert Parameter("fs1_loaded", 0.1, 0.1, "Nm").is_of_load
+    assert not Parameter("mx:grip_loaded", 0.1, 0.1, "kg m").is_of_load
+    assert not Parameter("fs1", 0.1, 0.1, "Nm").is_of_load
+
+
+def test_a_body_is_weighed_beside_bare_runs_of_another_friction(truth: Truth, calibration: Calibration) -> None:
+    rng = np.random.default_rng(13)
+    model = replace(truth.model, friction_by_load=True)
+    bare = record(truth, "bare", rng, noise_a=NOISE_A, rate_hz=500.0)
+    loaded = record(_warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0)
+    mass = list(LINK_PARAMETERS).index("m")
+    weighed = weigh(calibration, model, (loaded,), CONDITIONING, bare=(bare,))
+    one_friction = weigh(calibration, truth.model, (loaded,), CONDITIONING, bare=(bare,))
+    error_kg = abs(weighed.values[mass] - PAYLOAD_TRUTH["m"])
+    assert error_kg < 3.0 * weighed.std[mass]
+    assert weighed.std[mass] < 0.3 * one_friction.std[mass]
