@@ -57,8 +57,8 @@ class Parameter:
     unit: str
 
     @property
-    def is_of_load(self) -> bool:
-        """Whether it is, or leads with, what a payload adds to friction (`Model.friction_by_load`)."""
+    def is_payload_friction(self) -> bool:
+        """Whether it is, or leads with, what a payload adds to friction (`Model.friction_by_payload`)."""
         is_of_robot = ":" not in self.name  # behind a colon is the mounting of a payload
         return is_of_robot and self.name.split(" ", 1)[0].endswith(LOADED)
 
@@ -225,9 +225,9 @@ class Calibration:
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
 
     @property
-    def friction_by_load(self) -> bool:
+    def friction_by_payload(self) -> bool:
         """Whether friction with a payload has parameters of its own."""
-        return any(parameter.is_of_load for parameter in self.parameters)
+        return any(parameter.is_payload_friction for parameter in self.parameters)
 
     @property
     def gains_fixed(self) -> bool:

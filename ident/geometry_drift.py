@@ -67,7 +67,7 @@ def geometry_drift(
     model = replace(corrected, robot=replace(corrected.robot, declared_gravity_m_s2=None))
     slow = at_rows(corrected_dataset(data, corrections), conditioning)
     move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
-    standard = model.mounted(standard_parameters(calibration, model), payload_of(calibration, data))
+    standard = model.with_payload(standard_parameters(calibration, model), payload_of(calibration, data))
     gains = np.array([gain.value for gain in calibration.gains])
     signals = declared_signals(model, slow, standard, gains, calibration.session_began_s, inertia=False)
     scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])

@@ -45,7 +45,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     corrections = corrections_of(calibration)
     model = fitted_model(calibration, model)
     data = corrected_dataset(data, corrections)
-    standard = model.mounted(standard_parameters(calibration, model), payload_of(calibration, data))
+    standard = model.with_payload(standard_parameters(calibration, model), payload_of(calibration, data))
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
@@ -62,15 +62,15 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
 
 
 def fitted_model(calibration: Calibration, model: Model) -> Model:
-    """The declared model as a calibration has corrected its geometry, with friction by load where it has identified it.
+    """The declared model with the corrections of a calibration, with friction by payload where it has identified that.
 
     Raises:
         EffectRefused: it holds an effect that does not exist.
     """
     model = corrected_model(model, corrections_of(calibration))
     # A new model would follow the motions of closed chains again.
-    is_lacking = calibration.friction_by_load and not model.friction_by_load
-    return replace(model, friction_by_load=True) if is_lacking else model
+    is_lacking = calibration.friction_by_payload and not model.friction_by_payload
+    return replace(model, friction_by_payload=True) if is_lacking else model
 
 
 def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
@@ -152,7 +152,7 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
 
     A base parameter β gathers the columns that depend on its leading one (paper §2.1), W_st χ_st = W β for every χ_st
     with this β; the simplest one holds β at the leading columns, which name the base parameters, and zero elsewhere.
-    What a payload adds to friction is left out where the model has no friction by load.
+    What a payload adds to friction is left out where the model has no friction by payload.
 
     Raises:
         ModelError: a parameter is none of this robot's.
@@ -163,7 +163,7 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     for parameter in calibration.parameters:
         if parameter.name in of_effects or ":" in parameter.name:
             continue
-        if parameter.is_of_load and not model.friction_by_load:
+        if parameter.is_payload_friction and not model.friction_by_payload:
             continue
         leading = parameter.name.split()[0] if parameter.name.split() else ""
         if leading not in index:

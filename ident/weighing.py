@@ -223,10 +223,11 @@ def _rows_of(model: Model, datasets: tuple[Dataset, ...], bare: int, conditionin
     """Build the rows of runs, those without the body first."""
     rows = observe(model, datasets, conditioning, standard_equations(model))
     is_mounted = rows.run >= bare
-    if model.friction_by_load:
+    if model.friction_by_payload:
         # What the runs say of their payload is ignored, but their friction is that of a loaded arm.
-        friction = rows.regressor[:, model.friction_columns] * is_mounted
-        rows.regressor[:, model.loaded_friction_columns] = friction
+        regressor = rows.regressor.copy()
+        regressor[:, model.loaded_friction_columns] = regressor[:, model.friction_columns] * is_mounted
+        rows = replace(rows, regressor=regressor)
     body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
     rows = rows.extended(body, rows.flange * is_mounted)
     return RowsToWeigh(model, datasets, bare, rows)
@@ -253,7 +254,7 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
 
     def signals(datasets: Sequence[Dataset], body: FloatArray | None) -> list[Signals]:
-        whole = model.mounted(standard, body)
+        whole = model.with_payload(standard, body)
         began_s = calibration.session_began_s
         if not effects:
             return []

@@ -195,7 +195,7 @@ class Cell:
     unguarded: Permission = Permission.REFUSED
     recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
-    friction_by_load: bool = False  #: whether friction with a payload has parameters of its own (`ident.model.model`)
+    friction_by_payload: bool = False  #: whether friction with a payload has parameters of its own
     target_sigma_percent: float = DEFAULT_TARGET_SIGMA_PERCENT  #: σ of every gain at which a guided session ends [%]
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
     recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
@@ -265,4 +265,4 @@ def model_of(cell: Cell) -> Model:
     Raises:
         ModelError: the URDF or the drive train describes no robot.
     """
-    return Model(robot_of(cell), DriveTrain(cell.ratio), friction_by_load=cell.friction_by_load)
+    return Model(robot_of(cell), DriveTrain(cell.ratio), friction_by_payload=cell.friction_by_payload)

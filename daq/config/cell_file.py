@@ -104,7 +104,7 @@ def cell_from_bundle(
         unguarded=model.policy.unguarded,
         recovery_motion=model.policy.recovery_motion,
         apply=model.policy.apply,
-        friction_by_load=model.friction_by_load,
+        friction_by_payload=model.friction_by_payload,
         target_sigma_percent=model.target_sigma_percent,
         history=None if file is None else model.history.place(file, controller),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),

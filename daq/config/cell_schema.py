@@ -272,7 +272,7 @@ class CellModel(StrictModel):
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
     effects: tuple[EffectModel, ...] = ()
-    friction_by_load: Annotated[
+    friction_by_payload: Annotated[
         bool,
         Field(
             description="Whether friction with a payload has parameters of its own, so that friction that changes "

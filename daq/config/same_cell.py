@@ -129,7 +129,7 @@ def _sections(cell: Cell) -> dict[str, object]:
         "axes": cell.axes,
         "payloads": cell.payloads,
         "effects": cell.effects,
-        "friction_by_load": cell.friction_by_load,
+        "friction_by_payload": cell.friction_by_payload,
         "conditioning": cell.conditioning,
     }
 

@@ -6,9 +6,9 @@ With one friction for all blocks, pairs follow in an order that cancels drift: l
 the bare and of the loaded blocks then lie at the same time, and friction that falls evenly as the arm gets warm is the
 same for both.
 
-With `friction_by_load`, a change of friction between bare and loaded blocks is no gain, in whatever order they come. So
-the order is the one that takes a person the least time, and a change of the payload takes minutes. Of n bare and k
-loaded blocks, σ² of a gain falls as 1/n + 1/k: gains are seen by the difference of the two. Where the time of the
+With `friction_by_payload`, a change of friction between bare and loaded blocks is no gain, in whatever order they come.
+So the order is the one that takes a person the least time, and a change of the payload takes minutes. Gains are seen by
+the difference of bare and loaded blocks: of n and k of them, σ² of a gain falls as 1/n + 1/k. Where the time of the
 session is too short for the target, the order is the one that leaves σ smallest at its end.
 """
 
@@ -75,12 +75,15 @@ def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, mos
         most: number of blocks until the recording ends, at least one.
     """
     wanted = (1.0 / so_far.bare + 1.0 / so_far.loaded) / variance_ratio * (1.0 + ROUNDING)
-    enough = [way for bare in range(most + 1) if (way := _with_bare(so_far, bare, wanted)) is not None]
-    in_time = [way for way in enough if 1 <= way.count <= most]
+    in_time: list[BlocksToCome] = []
+    for bare in range(most + 1):
+        way = _with_bare(so_far, bare, wanted)
+        if way is not None and 1 <= way.count <= most:
+            in_time.append(way)
     if in_time:
         return min(in_time, key=lambda way: _time_s(so_far, way, block_s))
-    ways = [BlocksToCome(bare, most - bare) for bare in range(most + 1)]
-    return min(ways, key=lambda way: 1.0 / (so_far.bare + way.bare) + 1.0 / (so_far.loaded + way.loaded))
+    all_the_time = [BlocksToCome(bare, most - bare) for bare in range(most + 1)]
+    return min(all_the_time, key=lambda way: 1.0 / (so_far.bare + way.bare) + 1.0 / (so_far.loaded + way.loaded))
 
 
 def next_role(so_far: BlocksSoFar, way: BlocksToCome) -> BlockRole:

@@ -148,15 +148,17 @@ class UntilPrecise:
             gains: by these blocks; empty where they are not known yet.
             number: of the block, from 0.
         """
-        is_free = number >= len(FIRST_BLOCKS) and context.cell.friction_by_load and bool(gains)
-        if not is_free:
+        is_one_of_first = number < len(FIRST_BLOCKS)
+        if is_one_of_first or not gains or not context.cell.friction_by_payload:
             return fixed_role(number)
         mounted = {block.name: block.payload is not None for block in state.blocks}
         recorded = [run.name for run in state.runs if run.name in mounted]
         so_far = blocks_so_far(state.blocks, is_mounted=mounted[recorded[-1]])
-        left_s = 60.0 * self.settings.time_limit_min - self.settings.block_s * len(state.blocks)
-        most = max(1, math.floor(left_s / self.settings.block_s))
-        return next_role(so_far, quickest_way(so_far, _variance_ratio(gains), self.settings.block_s, most))
+        block_s = self.settings.block_s
+        until_limit_s = 60.0 * self.settings.time_limit_min - block_s * len(state.blocks)
+        most = max(1, math.floor(until_limit_s / block_s))
+        way = quickest_way(so_far, _variance_ratio(gains), block_s, most)
+        return next_role(so_far, way)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
@@ -210,6 +212,7 @@ class UntilPrecise:
         gains = estimate.gains
         motion_s = recorded * self.settings.block_s
         fitted_s = self.settings.block_s * sum(not block.holdout for block in state.blocks)
+        left_s = motion_left_s(context.cell, gains, state.blocks, self.settings.block_s)
         progress = state.progress
         if gains:
             std_percent = tuple(gain.std_percent for gain in gains)
@@ -221,7 +224,7 @@ class UntilPrecise:
                 gains=[gain.model_dump() for gain in gains],
                 blocks=recorded,
                 motion_s=motion_s,
-                left_s=motion_left_s(context.cell, gains, state.blocks, self.settings.block_s),
+                left_s=left_s,
             )
         has_held_out = any(block.holdout for block in state.blocks)
         is_precise = bool(gains) and all(gain.is_precise for gain in gains) and has_held_out
@@ -230,7 +233,6 @@ class UntilPrecise:
         would_help: tuple[str, ...] = ()
         if is_time_up and not is_precise:
             missing = _missing(gains, self.settings.time_limit_min)
-            left_s = motion_left_s(context.cell, gains, state.blocks, self.settings.block_s)
             would_help = _would_help(estimate, motion_s + left_s)
             context.journal.say(Level.NOTICE, "time is up", missing=missing, would_help=would_help)
         elif not is_precise:
@@ -282,12 +284,9 @@ class UntilPrecise:
 
     def _later_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
         """Load the moves that were planned for the worst gain; where there are none, make some for all gains."""
-        planned = None
         with suppress(ConfigurationError):  # what is missing or damaged is made again
-            planned = load_plan(path, context.cell)
-        if planned is None:
-            planned = self._unaimed_plan(context, session, number, path)
-        return planned
+            return load_plan(path, context.cell)
+        return self._unaimed_plan(context, session, number, path)
 
     def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
         """Make moves for all gains, inside the room of the first blocks."""
@@ -459,7 +458,7 @@ def motion_left_s(cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block
     """
     if not gains:
         return 0.0
-    if not cell.friction_by_load:
+    if not cell.friction_by_payload:
         fitted_s = block_s * sum(not block.holdout for block in blocks)
         std_percent = np.array([gain.std_percent for gain in gains])
         target_percent = np.array([gain.target_percent for gain in gains])

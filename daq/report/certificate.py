@@ -520,8 +520,8 @@ def order_text(calibration: Calibration) -> str:
     """In which order bare and loaded runs of the fit were recorded, and what that does to slow changes.
 
     Empty where a time is not known, or all runs are of one kind. The means of their places in the order are compared:
-    friction that changes evenly from run to run is the same for both kinds where these are equal. With friction by load
-    the order does not matter.
+    friction that changes evenly from run to run is the same for both kinds where these are equal. With friction by
+    payload the order does not matter.
     """
     timed: list[tuple[float, bool]] = []
     for source in calibration.sources:
@@ -536,9 +536,9 @@ def order_text(calibration: Calibration) -> str:
     if not loaded_places or not bare_places:
         return ""
     listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
-    by_load = [parameter for parameter in calibration.parameters if parameter.is_of_load]
-    if sum(parameter.name.startswith("fs") for parameter in by_load) >= len(calibration.gains):
-        return f"{listed}; friction by load: its change between them moves no gain"
+    by_payload = [parameter for parameter in calibration.parameters if parameter.is_payload_friction]
+    if sum(parameter.name.startswith("fs") for parameter in by_payload) >= len(calibration.gains):
+        return f"{listed}; friction by payload: its change between them moves no gain"
     later = fmean(loaded_places) - fmean(bare_places)
     if abs(later) <= BALANCED_PLACES:
         return f"{listed}; so an even warm-up moves no gain"

@@ -38,7 +38,6 @@ from ident.estimators.estimate import RelativeError
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
 MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
-FEW_MOVES = "it rests on "  #: How the refusal of a candidate on few moves begins (`ident.discovery.few_moves`)
 LITTLE = 0.005  #: Share of the squared residual; a candidate on few moves that explains less is not worth a sentence
 MOST = 0.75  #: Share of the folds on which such a candidate must lower the error
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
@@ -428,19 +427,20 @@ def _refused(fitted: Fit) -> Iterator[str]:
 
 
 def _on_few_moves(fitted: Fit) -> Iterator[str]:
-    """Of each axis, name the candidate that helps most and rests on too few moves to be tested, and what to record."""
-    best: dict[int, tuple[Finding, str]] = {}
+    """Name, for each axis, the best candidate that too few moves show, and say what to record."""
+    best: dict[int, Finding] = {}
     for finding in fitted.steps[-1].findings:
-        untested = next((refusal for refusal in finding.refusals if refusal.startswith(FEW_MOVES)), None)
         # `_refused` names a large one with all that it failed.
         is_of_size = LITTLE <= finding.explained < MUCH
-        helps = finding.held_out_fall > 0.0 and finding.folds_better >= MOST and not finding.impossible
-        if untested is not None and is_of_size and helps:
-            best.setdefault(finding.axis, (finding, untested))
+        helps = finding.held_out_fall > 0.0 and finding.folds_better >= MOST
+        is_possible = not finding.impossible
+        if finding.too_few_moves and is_of_size and helps and is_possible:
+            best.setdefault(finding.axis, finding)
     axes = fitted.cell.place_names
-    for finding, untested in best.values():
+    for finding in best.values():
         name = placed_by(finding).axis_name(axes)
-        yield f"These moves do not tell whether {name} has {effect_text(finding.effect, axes)}: {untested}."
+        effect = effect_text(finding.effect, axes)
+        yield f"These moves do not tell whether {name} has {effect}: {finding.too_few_moves}."
 
 
 _FLOOR_CAUSES = {

@@ -72,7 +72,8 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     columns = model.regressor(random_motion(limits, SAMPLES, SEED))
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     known = {p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name}
-    known = {name: one for name, one in known.items() if not one.is_of_load}  # a URDF has the robot without load
+    # A URDF has the robot without a payload.
+    known = {name: parameter for name, parameter in known.items() if not parameter.is_payload_friction}
     base = regroup(model, tuple(known), columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
     placed = [placed_effect(effect, calibration)[0] for effect in calibration.effects]
     friction = frozenset(one.axis for one in placed if one.effect.declares is Property.ODD_IN_VELOCITY)

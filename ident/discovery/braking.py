@@ -2,14 +2,16 @@
 
 A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in for each other there:
 drag by a root of the speed, with a dry friction below zero, is right from a tenth of full speed on, and wrong below it.
-On a region of the workspace where the arm moves slowly, such a fit was off by 18 % of the torque where the one without
-it was off by 5 %. So dry and viscous friction are judged together with all effects of the speed on the axis,
+An axis of a real robot moved slowly in a region that was left out: there such a fit was off by 18 % of the torque, and
+the fit without the term by 5 %. So dry and viscous friction are judged together with all effects of the speed on the
+axis,
 
     f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs, in both directions,
 
 and may be below zero by no more than SIGMAS of its own σ. At rest, f is what the friction of the axis begins with.
-Friction by load, position or distance brakes too and is left out. An axis whose friction depends on the temperature is
-not judged: fs and fv are then those of a temperature that the runs need not have.
+Friction that grows with the load, or depends on position or distance, brakes too and is left out. An axis whose
+friction depends on the temperature is not judged: fs and fv are then those of a temperature that the runs need not
+have.
 """
 
 from __future__ import annotations
@@ -38,17 +40,18 @@ def pushing(evidence: Evidence, axis: int) -> str:
         evidence: a joint fit.
         axis: index of the axis.
     """
-    placed = [one for one in evidence.effects if one.axis == axis and isinstance(one.effect, SpeedFriction)]
-    by_temperature = any(one.axis == axis and one.effect.abscissa is Abscissa.TEMPERATURE for one in evidence.effects)
-    if not placed or by_temperature:
+    of_axis = [placed for placed in evidence.effects if placed.axis == axis]
+    terms = [(placed, placed.effect) for placed in of_axis if isinstance(placed.effect, SpeedFriction)]
+    by_temperature = any(placed.effect.abscissa is Abscissa.TEMPERATURE for placed in of_axis)
+    if not terms or by_temperature:
         return ""
     fastest = max(float(np.max(np.abs(data.velocity_rad_s[:, axis]))) for data in evidence.fit_runs)
     found: list[_Friction] = []
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
-            found += _friction_at(evidence, declared, placed, direction * fastest * SPEEDS)
-    worst = min(found, key=lambda one: one.torque + SIGMAS * one.std, default=None)
-    if worst is None or worst.torque + SIGMAS * worst.std >= 0.0:
+            found += _friction_at(evidence, declared, terms, direction * fastest * SPEEDS)
+    worst = min(found, key=lambda one: one.at_most, default=None)
+    if worst is None or worst.at_most >= 0.0:
         return ""
     rate = "m/s" if worst.unit == "N" else "rad/s"
     is_at_rest = abs(worst.speed) < 2.0 * fastest * SPEEDS[0]
@@ -74,6 +77,11 @@ class _Friction:
     std: float  #: [unit]
     unit: str
 
+    @property
+    def at_most(self) -> float:
+        """The largest friction that its σ allows [unit]."""
+        return self.torque + SIGMAS * self.std
+
 
 def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
     """The declared friction of an axis without load, and with it where that is another one.
@@ -95,7 +103,10 @@ def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
 
 
 def _friction_at(
-    evidence: Evidence, declared: _Declared, placed: Sequence[PlacedEffect], velocity: FloatArray
+    evidence: Evidence,
+    declared: _Declared,
+    terms: Sequence[tuple[PlacedEffect, SpeedFriction]],
+    velocity: FloatArray,
 ) -> list[_Friction]:
     """Friction at velocities of one sign, shape (k,)."""
     estimate = evidence.estimate
@@ -104,10 +115,9 @@ def _friction_at(
     weights = np.zeros((len(velocity), len(values)))
     weights[:, first + np.array(declared.dry)] = 1.0
     weights[:, first + np.array(declared.viscous)] = np.abs(velocity)[:, None]
-    for one in placed:
-        if isinstance(one.effect, SpeedFriction):
-            against_motion = np.sign(velocity) * one.effect.at_speed(velocity)
-            weights[:, first + own_unknowns(estimate, (one,))] = against_motion.T
+    for placed, effect in terms:
+        against_motion = np.sign(velocity) * effect.at_speed(velocity)
+        weights[:, first + own_unknowns(estimate, (placed,))] = against_motion.T
     torque = weights @ values
     std = np.sqrt(np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights))
     at_each = zip(velocity.tolist(), torque.tolist(), std.tolist(), strict=True)

@@ -75,6 +75,8 @@ class Finding:
     #: where it is not known, or nothing is left beyond it. No gate uses it.
     share_of_excess: float | None = None
     refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
+    #: What to record, where too few moves show it to tell it from noise: one of the refusals; else empty.
+    too_few_moves: str = ""
     impossible: str = ""  #: coefficients that physics does not allow, in words: one of the refusals
 
 
@@ -258,12 +260,14 @@ def _judge(
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
     false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
     chance = None if np.isnan(probability[best]) else float(probability[best])
-    if chance is None or is_tested_on_others(trial.rest):
-        by_chance = what_to_record(effect, trial.gram, trial.rest)
-    else:
-        by_chance = f"noise makes one as strong with p = {chance:.3f}"
+    may_be_noise = chance is None or chance > false_alarm
+    too_few_moves = ""
+    by_chance = "" if chance is None else f"noise makes one as strong with p = {chance:.3f}"
+    if may_be_noise and (chance is None or is_tested_on_others(trial.rest)):
+        too_few_moves = what_to_record(effect, trial.gram, trial.rest)
+        by_chance = too_few_moves
     verdicts = (
-        (chance is None or chance > false_alarm, by_chance),
+        (may_be_noise, by_chance),
         (folds_better < gates.folds_better, f"it is better on {100 * folds_better:.0f} % of the folds only"),
         # A small mistake of the geometry is spread over all motors, and bends their gains.
         (
@@ -296,6 +300,7 @@ def _judge(
         share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
         refusals=refusals,
+        too_few_moves=too_few_moves,
         impossible=ruled_out[best],
     )
 

@@ -203,7 +203,7 @@ def fitted_signals(
             identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
     body = None if data.payload is None else payload_parameters(data.payload, identified)
-    standard = model.mounted(standard, body)
+    standard = model.with_payload(standard, body)
     return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
 
 

@@ -440,18 +440,19 @@ def shown_base(standard: System) -> BaseParameters:
             raise JointStill(", ".join(standard.runs), (name,), found)
     names = tuple(column.name for column in standard.columns)
     columns = _linear_columns(standard)[:, : len(names)]
-    _leave_out_friction_without_bare_rows(standard.model, columns)
-    return base_parameters(columns, names)
+    return base_parameters(_with_one_friction_where_no_row_is_bare(standard.model, columns), names)
 
 
-def _leave_out_friction_without_bare_rows(model: Model, columns: FloatArray) -> None:
-    """Clear what a payload adds to a friction that no bare row shows: the two are one parameter then."""
-    if not model.friction_by_load:
-        return
+def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:
+    """The columns of W without what a payload adds to a friction that no bare row shows: the two are one parameter."""
+    if not model.friction_by_payload:
+        return columns
+    columns = columns.copy()
     for declared, added in zip(model.friction_columns, model.loaded_friction_columns, strict=True):
         apart = np.linalg.norm(columns[:, declared] - columns[:, added])
         if apart <= SMALLEST_COLUMN * np.linalg.norm(columns[:, declared]):
             columns[:, added] = 0.0
+    return columns
 
 
 def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:

@@ -21,7 +21,7 @@ from ident.arrays import FloatArray, require_kind
 from ident.errors import ModelError
 
 LOADED = "_loaded"
-"""Ends the name of what a payload adds to a friction parameter (`Model.friction_by_load`)."""
+"""Ends the name of what a payload adds to a friction parameter (`Model.friction_by_payload`)."""
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
 """Inertia about the link frame's origin, first moments, mass, in the paper's order; a payload is a link too (§2.2)."""
 

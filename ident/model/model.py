@@ -100,13 +100,13 @@ class Model:
     carry the off-diagonal part, as in the paper.
 
     Friction is not the same in all runs: it falls while the arm warms up, and changes with the torque on the gears.
-    Where the runs without load come first, the change looks like other gains. With `friction_by_load`, each friction
+    Where the runs without load come first, the change looks like other gains. With `friction_by_payload`, each friction
     parameter has one more at the end, NAME_loaded: what is added to it while a payload is mounted. The paper has none.
     """
 
     robot: Robot
     drive_train: DriveTrain  #: between motors and the joints of the axes
-    friction_by_load: bool = False  #: whether friction with a payload is another one than without
+    friction_by_payload: bool = False  #: whether friction with a payload is another one than without
     assembly: Assembly = field(init=False, compare=False, repr=False)  #: which joints are free, and how the loops close
     #: Followed motions by the digest of what was asked, the last one first.
     _followed: tuple[tuple[bytes, TreeMotion], ...] = field(default=(), init=False, compare=False, repr=False)
@@ -146,7 +146,7 @@ class Model:
             force, rate, inertia = DRIVE_UNITS[self.robot.axes[self.drive_train.joints[motor]].kind]
             coupling = ("Iam", inertia), ("fvm", f"{force}/({rate})"), ("fsm", force)
             columns += [Column(f"{name}{motor + 1}", unit) for name, unit in coupling]
-        if self.friction_by_load:
+        if self.friction_by_payload:
             friction = [columns[place] for place in self.friction_columns]
             columns += [replace(column, name=f"{column.name}{LOADED}") for column in friction]
         return tuple(columns)
@@ -183,7 +183,7 @@ class Model:
     def loaded_friction_columns(self) -> IntArray:
         """Columns of what a payload adds to the friction parameters, in the order of `friction_columns`; or empty."""
         declared = JOINT_COLUMNS * self.robot.joint_count + 3 * len(self.drive_train.coupled)
-        return declared + np.arange(len(self.friction_columns) if self.friction_by_load else 0)
+        return declared + np.arange(len(self.friction_columns) if self.friction_by_payload else 0)
 
     @property
     def flange(self) -> slice:
@@ -211,7 +211,7 @@ class Model:
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
             out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
-        if self.friction_by_load:
+        if self.friction_by_payload:
             out[:, self.loaded_friction_columns] = out[:, self.friction_columns]
         return out
 
@@ -298,11 +298,11 @@ class Model:
             out[axes, first] = cross @ acceleration[axes]
             out[axes, first + 1] = cross @ velocity[axes]
             out[axes, first + 2] = r[:, None] * np.sign(motor_speed[motor])
-        if loaded and self.friction_by_load:
+        if loaded and self.friction_by_payload:
             out[:, self.loaded_friction_columns] = out[:, self.friction_columns]
         return out
 
-    def mounted(self, standard: FloatArray, body: FloatArray | None) -> FloatArray:
+    def with_payload(self, standard: FloatArray, body: FloatArray | None) -> FloatArray:
         """Standard parameters of the robot with what is mounted, shape (c,).
 
         Args:
@@ -313,7 +313,7 @@ class Model:
             return standard
         whole = standard.copy()
         whole[self.flange] += body
-        if self.friction_by_load:
+        if self.friction_by_payload:
             whole[self.friction_columns] += standard[self.loaded_friction_columns]
         return whole
 
@@ -324,7 +324,7 @@ class Model:
 
         Args:
             motion: of m axes over k samples.
-            standard: χ_st with what is mounted (`mounted`), shape (c,).
+            standard: χ_st with what is mounted (`with_payload`), shape (c,).
 
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.

@@ -239,8 +239,8 @@ class Design:
         base = len(self.base.independent)
         place = list(range(base))
         if payload is None:
-            of_load = set(self.expectation.model.loaded_friction_columns.tolist())
-            place = [index for index in place if self.base.independent[index] not in of_load]
+            payload_friction = set(self.expectation.model.loaded_friction_columns.tolist())
+            place = [index for index in place if self.base.independent[index] not in payload_friction]
         source = list(place)
         if payload is not None:
             unknown = self.expectation.payloads[payload].unknown
@@ -254,8 +254,8 @@ class Design:
 
         What a payload adds to friction is left out: in bare or in loaded runs alone it is no unknown of its own.
         """
-        of_load = self.expectation.model.loaded_friction_columns
-        asked = np.flatnonzero(~np.isin(self.base.independent, of_load))
+        payload_friction = self.expectation.model.loaded_friction_columns
+        asked = np.flatnonzero(~np.isin(self.base.independent, payload_friction))
         values = np.linalg.eigvalsh(information[np.ix_(asked, asked)])
         return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
 

@@ -4,10 +4,10 @@
     python -m tests.studies.session_study --shard 1/4 --minutes 60      goes on where it ended
 
 Each shipped robot is calibrated over the driver by `daq.jobs.calibrate.calibrate`, until σ of every gain is 0.5 %. The
-time is that of the motion, and three minutes for each change of the payload. Its cell file has `friction_by_load`, as
-those that `drivegain init` writes. Step by step it is the shortest of five durations of a plan whose three runs (bare,
-loaded, held out) give every gain within 1 % of the truth. Both ways have the same plant, noise of their own, and plans
-of their own. Layout: out/session-study/<robot>-<seed>.json.
+time is that of the motion, and three minutes for each change of the payload. Its cell file has `friction_by_payload`,
+as those that `drivegain init` writes. Step by step it is the shortest of five durations of a plan whose three runs
+(bare, loaded, held out) give every gain within 1 % of the truth. Both ways have the same plant, noise of their own, and
+plans of their own. Layout: out/session-study/<robot>-<seed>.json.
 """
 
 from __future__ import annotations
@@ -93,13 +93,14 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
     shutil.copytree(shipped_configurations(), folder / "configs")
     cell_file = folder / "configs" / "cells" / f"{robot.cell}.yaml"
     cell = load_cell(cell_file)
-    by_load_file = cell_file.with_name(f"{robot.cell}-by-load.yaml")
-    by_load_file.write_text(f"{cell_file.read_text(encoding='utf-8')}friction_by_load: true\n", encoding="utf-8")
+    by_payload_file = cell_file.with_name(f"{robot.cell}-by-payload.yaml")
+    shipped = cell_file.read_text(encoding="utf-8")
+    by_payload_file.write_text(f"{shipped}friction_by_payload: true\n", encoding="utf-8")
     plant = Plant(robot, seed)
     return {
         "robot": robot.name,
         "seed": seed,
-        "guided": guided_way(plant, by_load_file, load_cell(by_load_file), folder),
+        "guided": guided_way(plant, by_payload_file, load_cell(by_payload_file), folder),
         "step_by_step": step_by_step(plant, cell_file, cell, folder),
     }
 

@@ -6,7 +6,7 @@
 Each cell is simulated twice with the same noise, moves and times: with friction that falls on all axes, and with
 friction that stays. The difference of the gains is what the warm-up does. *Bare, then loaded* is how it is done step by
 step. *Guided* is the order that cancels drift (`daq.jobs.block_order`), up to the seventh block. Both have three bare
-and three loaded blocks in the fit. Each is fitted with one friction for all blocks, and with `friction_by_load`.
+and three loaded blocks in the fit. Each is fitted with one friction for all blocks, and with `friction_by_payload`.
 Layout: out/warm-up-study/<cell>.csv.
 """
 
@@ -54,7 +54,7 @@ FIRST_PLAN = 5001
 BARE_THEN_LOADED = (BlockRole.BARE,) * 3 + (BlockRole.LOADED,) * 3 + (BlockRole.HELD_OUT,)
 GUIDED = (*FIRST_BLOCKS, *NEXT_BLOCKS)
 ORDERS = {"bare, then loaded": BARE_THEN_LOADED, "guided": GUIDED}
-FRICTIONS = {"one": False, "by load": True}
+FRICTIONS = {"one": False, "by payload": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Row:
     seed: int
     time_constant_min: float
     order: str
-    friction: str  #: of the model: one for all blocks, or by load
+    friction: str  #: of the model: one for all blocks, or by payload
     bent_percent: float  #: largest change of a gain by the warm-up, of the fit without a search
     searched_bent_percent: float  #: the same after the search, whose dictionary has such a friction
     named: tuple[str, ...]  #: what the search found in the cell that warms up
@@ -131,8 +131,8 @@ def study(unit: WarmingCell) -> tuple[Row, ...]:
     for order, roles in ORDERS.items():
         steady_runs = simulated(drawn, declared, roles, None)
         warming_runs = simulated(drawn, declared, roles, unit.time_constant_min)
-        for friction, by_load in FRICTIONS.items():
-            cell = replace(declared, friction_by_load=by_load)
+        for friction, by_payload in FRICTIONS.items():
+            cell = replace(declared, friction_by_payload=by_payload)
             steady = _gains(cell, steady_runs, roles)
             warming = _gains(cell, warming_runs, roles)
             row = Row(
@@ -218,10 +218,10 @@ def summary(rows: Sequence[Row]) -> str:
 
 def _line(name: str, rows: Sequence[Row]) -> str:
     first = rows[0]
-    bent, searched, error, std = (
-        float(np.mean([getattr(row, field) for row in rows]))
-        for field in ("bent_percent", "searched_bent_percent", "error_percent", "steady_std_percent")
-    )
+    bent = np.mean([row.bent_percent for row in rows])
+    searched = np.mean([row.searched_bent_percent for row in rows])
+    error = np.mean([row.error_percent for row in rows])
+    std = np.mean([row.steady_std_percent for row in rows])
     figures = f"{bent:.2f} | {searched:.2f} | {error:.2f} | {std:.2f}"
     return f"| {name} | {first.order} | {first.friction} | {len(rows)} | {figures} |"
 

@@ -582,13 +582,13 @@ def test_from_the_fourth_block_on_moves_are_for_the_worst_gain(
     assert all(gain.cause for gain in state.gains)
 
 
-def test_with_friction_by_load_the_payload_stays_on_while_that_is_quicker(
+def test_with_friction_by_payload_the_payload_stays_on_while_that_is_quicker(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     planned: list[dict[str, Any]] = []
     rig = aimed_rig(tmp_path / "cell", made_session, planned)
     document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
-    rig.cell_file.write_text(json.dumps({**document, "friction_by_load": True}), encoding="utf-8")
+    rig.cell_file.write_text(json.dumps({**document, "friction_by_payload": True}), encoding="utf-8")
     gains = made_session.calibration.gains
     after_three_percent = max(100.0 * abs(gain.std / gain.value) for gain in gains)
     # Five more loaded blocks reach it; this rig has copies of two.

@@ -107,11 +107,11 @@ def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
     ]
     assert motion_left_s(cell, gains, blocks, 30.0) == pytest.approx(180.0)
     assert motion_left_s(cell, gains[:1], blocks, 30.0) == 0.0
-    # Three more blocks of each kind, as friction by load needs no order.
-    by_load = replace(cell, friction_by_load=True)
-    assert motion_left_s(by_load, gains, blocks, 30.0) == pytest.approx(180.0)
-    assert motion_left_s(by_load, gains[:1], blocks, 30.0) == 0.0
-    assert motion_left_s(by_load, [], blocks, 30.0) == 0.0
+    # Three more blocks of each kind, as friction by payload needs no order.
+    by_payload = replace(cell, friction_by_payload=True)
+    assert motion_left_s(by_payload, gains, blocks, 30.0) == pytest.approx(180.0)
+    assert motion_left_s(by_payload, gains[:1], blocks, 30.0) == 0.0
+    assert motion_left_s(by_payload, [], blocks, 30.0) == 0.0
 
 
 def test_a_warning_is_said_once_and_what_is_for_programs_never() -> None:

@@ -432,11 +432,11 @@ def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str,
     assert order_text(calibration) == said
 
 
-def test_with_friction_by_load_no_order_of_runs_moves_the_gains() -> None:
-    by_load = tuple(Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7))
+def test_with_friction_by_payload_no_order_of_runs_moves_the_gains() -> None:
+    by_payload = tuple(Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7))
     declared = demo_calibration()
-    calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, *by_load))
-    said = "bare, bare, loaded, loaded; friction by load: its change between them moves no gain"
+    calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, *by_payload))
+    said = "bare, bare, loaded, loaded; friction by payload: its change between them moves no gain"
     assert order_text(calibration) == said
     lacking = replace(calibration, parameters=calibration.parameters[:-1])
     assert "so a warm-up moves the gains" in order_text(lacking)

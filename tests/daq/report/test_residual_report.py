@@ -657,7 +657,8 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     two_moves_only = np.zeros((20, 1, 1))
     two_moves_only[:2] = 1.0
     why = what_to_record(Saturation(), two_moves_only, None)
-    untested = replace(finding(PlacedEffect(Saturation(), 1), passed=False), explained=0.01, refusals=(why,))
+    small = finding(PlacedEffect(Saturation(), 1), passed=False)
+    untested = replace(small, explained=0.01, refusals=(why,), too_few_moves=why)
     weaker = replace(untested, effect=Spring())
     impossible = replace(untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0")
     no_help = replace(untested, axis=3, held_out_fall=-1.0)

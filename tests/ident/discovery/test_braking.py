@@ -115,13 +115,13 @@ def test_columns_are_the_torque_at_the_speed_of_the_joint(effect: SpeedFriction)
 
 def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
     """Without load the axis brakes; with it, what the payload adds to the friction is more than there was."""
-    by_load = replace(truth, model=replace(truth.model, friction_by_load=True))
+    by_payload = replace(truth, model=replace(truth.model, friction_by_payload=True))
     rng = np.random.default_rng(12)
     runs = [
         record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0)
         for number, payload in enumerate((None, MOUNTED))
     ]
-    fitted = with_effects(gathered(by_load, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))
+    fitted = with_effects(gathered(by_payload, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))
     assert pushing(fitted, AXIS) == ""
     names = [column.name for column in fitted.estimate.unknowns]
     parameters = fitted.estimate.parameters.copy()

@@ -106,6 +106,7 @@ def test_a_saturation_that_rests_on_few_moves_is_tested_by_the_others_where_they
     (finding,) = _judged(search_problem, trial)
     assert finding.probability is not None
     assert finding.probability <= GATES.false_alarm
+    assert finding.too_few_moves == ""
 
 
 @pytest.mark.parametrize("others", [0.0, 1e-3])
@@ -118,6 +119,7 @@ def test_a_saturation_on_two_moves_alone_is_not_tested_and_says_what_to_record(
     assert finding.probability is None
     assert not finding.passed
     assert finding.refusals[0] == (f"it rests on two moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}")
+    assert finding.too_few_moves == finding.refusals[0]
 
 
 def test_noise_on_few_moves_that_the_others_do_not_show_is_no_effect(search_problem: SearchProblem) -> None:

@@ -240,7 +240,7 @@ def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
 
 
 def test_what_a_payload_adds_to_friction_is_seen_in_loaded_runs_alone(truth: Truth) -> None:
-    model = replace(truth.model, friction_by_load=True)
+    model = replace(truth.model, friction_by_payload=True)
     rng = np.random.default_rng(21)
     runs = [record(truth, f"run{number}", rng, payload, seconds=8.0) for number, payload in enumerate((None, MOUNTED))]
     base = identify(model, runs, CONDITIONING, judge=False).system.base
@@ -248,13 +248,13 @@ def test_what_a_payload_adds_to_friction_is_seen_in_loaded_runs_alone(truth: Tru
     noise = np.full(6, NOISE_A)
     payload = ExpectedPayload(frozenset({"m"}), PAYLOAD)
     design = Design(Expectation(model, truth.gains, parameters, (payload,), noise), base)
-    of_load = [place for place, column in enumerate(base.independent) if column in model.loaded_friction_columns]
-    assert len(of_load) == len(model.loaded_friction_columns)
+    payload_friction = np.flatnonzero(np.isin(base.independent, model.loaded_friction_columns))
+    assert len(payload_friction) == len(model.loaded_friction_columns)
     excitation = _excitation(rng)
     bare = design.information(excitation, (None,))
     loaded = design.information(excitation, (0,))
-    assert not bare[of_load].any()
-    assert np.all(np.diag(loaded)[of_load] > 0.0)
+    assert not bare[payload_friction].any()
+    assert np.all(np.diag(loaded)[payload_friction] > 0.0)
     for seen in (bare, loaded, bare + loaded):
         assert np.isfinite(design.condition(seen))
     assert np.isfinite(design.std_percent(bare + loaded)).all()

@@ -52,7 +52,7 @@ def runs(truth: Truth) -> tuple[Run, ...]:
 
 @pytest.fixture(scope="module")
 def found(truth: Truth, runs: tuple[Run, ...]) -> Identification:
-    return identify(replace(truth.model, friction_by_load=True), runs, CONDITIONING)
+    return identify(replace(truth.model, friction_by_payload=True), runs, CONDITIONING)
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +89,9 @@ def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     ]
     shared = identify(truth.model, runs, CONDITIONING)
-    by_load = identify(replace(truth.model, friction_by_load=True), runs, CONDITIONING)
-    assert np.all(_sigmas_off(by_load, truth) < 3.5)
-    assert np.all(by_load.estimate.gains_std < 1.3 * shared.estimate.gains_std)
+    by_payload = identify(replace(truth.model, friction_by_payload=True), runs, CONDITIONING)
+    assert np.all(_sigmas_off(by_payload, truth) < 3.5)
+    assert np.all(by_payload.estimate.gains_std < 1.3 * shared.estimate.gains_std)
 
 
 @pytest.mark.parametrize("payload", [None, MOUNTED])
@@ -103,20 +103,20 @@ def test_a_calibration_predicts_with_the_friction_of_what_is_mounted(
     run = record(arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0)
     data = differentiate(run, truth.model.drive_train, CONDITIONING)
     body = None if mounted is None else np.array(list(PAYLOAD_TRUTH.values()))
-    # The model of a cell: that the calibration has friction by load is read from its parameters.
+    # The model of a cell: that the calibration has friction by payload is read from its parameters.
     predicted = predict_torque(calibration, truth.model, data)
-    expected = arm.model.torques(data.motion(), arm.model.mounted(arm.parameters, body))[2].T
+    expected = arm.model.torques(data.motion(), arm.model.with_payload(arm.parameters, body))[2].T
     moving = np.abs(data.velocity_rad_s) > 0.1
     left = np.sqrt(np.mean((predicted - expected)[moving] ** 2) / np.mean(expected[moving] ** 2))
     assert left < 0.01
     other = _warmer(truth) if mounted is None else truth
-    wrong = other.model.torques(data.motion(), other.model.mounted(other.parameters, body))[2].T
+    wrong = other.model.torques(data.motion(), other.model.with_payload(other.parameters, body))[2].T
     assert np.sqrt(np.mean((predicted - wrong)[moving] ** 2) / np.mean(expected[moving] ** 2)) > 0.02
 
 
 def test_a_model_without_it_takes_the_friction_without_load(truth: Truth, calibration: Calibration) -> None:
     model = fitted_model(calibration, truth.model)
-    assert model.friction_by_load
+    assert model.friction_by_payload
     whole = standard_parameters(calibration, model)
     declared = standard_parameters(calibration, truth.model)
     np.testing.assert_array_equal(declared, whole[: len(declared)])
@@ -127,7 +127,7 @@ def test_a_model_without_it_takes_the_friction_without_load(truth: Truth, calibr
 def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(make: object) -> None:
     assert callable(make)
     declared: Model = make().model
-    model = replace(declared, friction_by_load=True)
+    model = replace(declared, friction_by_payload=True)
     rng = np.random.default_rng(3)
     axes = model.robot.axis_count
     motion = Motion(*rng.normal(size=(3, 50, axes)))
@@ -146,7 +146,7 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
         if mounted is not None:
             by_columns += np.einsum("mck,c->mk", regressor[:, model.flange], body)
         np.testing.assert_allclose(
-            model.torques(motion, model.mounted(parameters, mounted))[2], by_columns, rtol=1e-9, atol=1e-9
+            model.torques(motion, model.with_payload(parameters, mounted))[2], by_columns, rtol=1e-9, atol=1e-9
         )
 
 
@@ -158,23 +158,23 @@ def test_where_every_run_is_loaded_there_is_one_friction(truth: Truth) -> None:
         record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0)
         for number, payload in enumerate((disc, plate))
     ]
-    by_load = replace(truth.model, friction_by_load=True)
+    by_payload = replace(truth.model, friction_by_payload=True)
     gains = truth.gains
     shared = identify(truth.model, runs, CONDITIONING, fixed_gains=gains, judge=False)
-    found = identify(by_load, runs, CONDITIONING, fixed_gains=gains, judge=False)
+    found = identify(by_payload, runs, CONDITIONING, fixed_gains=gains, judge=False)
     assert found.estimate.unknowns == shared.estimate.unknowns
     np.testing.assert_allclose(found.estimate.parameters, shared.estimate.parameters, rtol=1e-9, atol=1e-9)
 
 
 def test_a_mounting_of_any_name_is_no_friction() -> None:
-    assert Parameter("fs1_loaded", 0.1, 0.1, "Nm").is_of_load
-    assert not Parameter("mx:grip_loaded", 0.1, 0.1, "kg m").is_of_load
-    assert not Parameter("fs1", 0.1, 0.1, "Nm").is_of_load
+    assert Parameter("fs1_loaded", 0.1, 0.1, "Nm").is_payload_friction
+    assert not Parameter("mx:grip_loaded", 0.1, 0.1, "kg m").is_payload_friction
+    assert not Parameter("fs1", 0.1, 0.1, "Nm").is_payload_friction
 
 
 def test_a_body_is_weighed_beside_bare_runs_of_another_friction(truth: Truth, calibration: Calibration) -> None:
     rng = np.random.default_rng(13)
-    model = replace(truth.model, friction_by_load=True)
+    model = replace(truth.model, friction_by_payload=True)
     bare = record(truth, "bare", rng, noise_a=NOISE_A, rate_hz=500.0)
     loaded = record(_warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0)
     mass = list(LINK_PARAMETERS).index("m")

@@ -1,4 +1,4 @@
-"""`friction_by_load` of a cell file: friction with a payload is its own in the fit, the calibration and predictions."""
+"""`friction_by_payload` of a cell file: friction with a payload is its own in fit, calibration and predictions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WARMER = 0.75  #: Friction in the loaded runs over that in the bare ones, which 
 
 @pytest.fixture(scope="module")
 def cell() -> Cell:
-    return replace(load_cell(shipped_configurations() / "cells" / "demo.yaml"), friction_by_load=True)
+    return replace(load_cell(shipped_configurations() / "cells" / "demo.yaml"), friction_by_payload=True)
 
 
 @pytest.fixture(scope="module")
@@ -68,20 +68,21 @@ def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_pa
 
 
 def test_without_the_key_friction_that_falls_becomes_gain(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_module, "load_run", replace(shelf, cell=replace(shelf.cell, friction_by_load=False)).load)
+    without_key = replace(shelf, cell=replace(shelf.cell, friction_by_payload=False))
+    monkeypatch.setattr(fit_module, "load_run", without_key.load)
     fitted = fit([Path("run0"), Path("run1"), Path("run2")])
     assert np.max(np.abs(fitted.estimate.gains / GAINS - 1.0)) > 0.015
 
 
 def test_a_description_that_differs_in_it_is_another_one_for_a_fit(cell: Cell) -> None:
-    assert differing_sections(cell, replace(cell, friction_by_load=False)) == ("friction_by_load",)
+    assert differing_sections(cell, replace(cell, friction_by_payload=False)) == ("friction_by_payload",)
 
 
 def test_the_key_is_read_and_is_off_where_a_cell_file_does_not_have_it(tmp_path: Path) -> None:
     shipped = shipped_configurations() / "cells" / "demo.yaml"
-    assert not load_cell(shipped).friction_by_load
+    assert not load_cell(shipped).friction_by_payload
     text = shipped.read_text(encoding="utf-8")
     text = text.replace("urdf: ../robots/tx40.urdf", f"urdf: {shipped.parent.parent / 'robots' / 'tx40.urdf'}")
     changed = tmp_path / "demo.yaml"
-    changed.write_text(f"{text}friction_by_load: true\n", encoding="utf-8")
-    assert load_cell(changed).friction_by_load
+    changed.write_text(f"{text}friction_by_payload: true\n", encoding="utf-8")
+    assert load_cell(changed).friction_by_payload
