@@ -328,6 +328,7 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
         lossy=request.lossy,
         keep_rows=True,
         channels_as_wired=request.channels_as_wired,
+        judge_holdout=False,
     )
     undecided = Undecided.of(write=request.write_undecided, ignore_holdout=request.accept_worse_holdout)
     found = close_loop(fitted, request.seed, report_step, undecided)

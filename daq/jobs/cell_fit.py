@@ -99,8 +99,14 @@ def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> FleetFit | Failur
                     ) from error
                 paths[at_hand(seen.log, Path(folder))] = seen.log
             logs = list(paths)
-            fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :], keep_rows=loop is Loop.CLOSED)
-            if loop is Loop.CLOSED:
+            is_searched = loop is Loop.CLOSED
+            fitted = fit(
+                logs[: len(cell.fit)],
+                holdout=logs[len(cell.fit) :],
+                keep_rows=is_searched,
+                judge_holdout=not is_searched,
+            )
+            if is_searched:
                 fitted = close_loop(fitted, BOOTSTRAP_SEED)
                 check_holdout(fitted)
             for seen in every_log:

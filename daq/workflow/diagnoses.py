@@ -32,7 +32,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +65,11 @@ from ident.errors import (
     TooFewMoves,
 )
 from ident.estimators.diagnosis import (
+    ChannelTriangles,
+    channel_triangles,
     diagnose,
-    exchanged_channels,
+    exchange_shown_by,
+    explain_channels,
     unsigned_channels,
 )
 from ident.estimators.estimate import Estimate, Identification
@@ -95,6 +97,12 @@ class Recordings:
     read: ReadLog  #: reads a log as the fit did
     gains_fixed: bool  #: the fit holds the nameplate gains
     channels_as_wired: bool = False  #: the operator says that no currents are exchanged
+    described: Cell | None = None  #: the cell of the logs; None where they were not read yet
+
+    @property
+    def cell(self) -> Cell:
+        """The cell of the logs; that of the first one where they were not read yet."""
+        return self.described or self.read(self.logs[0])[1]
 
     def runs(self) -> Iterator[Run]:
         """One run after the other."""
@@ -192,7 +200,7 @@ def turned_geometry(
         corrected: model of the fit, as a search has corrected it. Where no other geometry explains the recordings
             better than this one, the search has named what is wrong, with σ.
     """
-    _, cell = recordings.read(recordings.logs[0])
+    cell = recordings.cell
     model = model_of(cell)
     nameplate = nameplate_of(cell)
     rows = instants or read_instants(model, recordings.runs(), cell.conditioning)
@@ -213,51 +221,48 @@ def turned_geometry(
 
 
 def require_right_currents(recordings: Recordings, *, each: bool = True) -> None:
-    """Refuse logs with currents without a sign, or with exchanged ones; they are read again.
+    """Refuse logs with currents without a sign, or with exchanged ones; they are read again, each once.
 
     Args:
         recordings: of the fit.
-        each: look for an exchange in each log alone, too.
+        each: look for an exchange in each log alone, too: in one of several, it is hidden by the others.
 
     Raises:
         CurrentUnsigned: drives report the size of the current only.
-        ChannelsExchanged: the currents of some axes are each other's.
+        ChannelsExchanged: the currents of some axes are each other's, in all logs together or in one of them.
     """
-    _, cell = recordings.read(recordings.logs[0])
+    cell = recordings.cell
+    model = model_of(cell)
     runs = list(recordings.runs())
-    unsigned = unsigned_channels(model_of(cell), runs, cell.conditioning, cell.axis_names)
+    unsigned = unsigned_channels(model, runs, cell.conditioning, cell.axis_names)
     if unsigned is not None:
         raise unsigned
-    if not recordings.channels_as_wired:
-        require_own_channels(recordings, each=each)
+    if recordings.channels_as_wired or model.is_redundant:  # internal preload is in every current of a redundant robot
+        return
+    reduced = [channel_triangles(model, run, cell.conditioning) for run in runs]
+    _require_own_channels(reduced, "the currents", cell)
+    if each and len(reduced) > 1:
+        for log, alone in zip(recordings.logs, reduced, strict=True):
+            _require_own_channels([alone], f"log {log.stem}: the currents", cell)
 
 
-def require_own_channels(recordings: Recordings, *, each: bool = True) -> None:
-    """Refuse logs in which the currents of some axes are each other's; they are read again.
+def _require_own_channels(runs: Sequence[ChannelTriangles], currents: str, cell: Cell) -> None:
+    """Refuse runs in which the currents of some axes are each other's.
 
     Args:
-        recordings: of the fit.
-        each: look into each log alone, too: in one of several, an exchange is hidden by the others.
-
-    Raises:
-        ChannelsExchanged: they are, in all logs together or in one of them.
+        runs: taken together.
+        currents: what the message calls their currents.
+        cell: of the runs.
     """
-    logs = recordings.logs
-    alone = [(log,) for log in logs] if each and len(logs) > 1 else []
-    for part in (logs, *alone):
-        found = _exchange_in(part, recordings.read)
-        if found is not None:
-            where = f"log {part[0].stem}: " if part in alone else ""
-            subject = f"{where}the currents of {' and '.join(found.axes)}"
-            remedy = f"{found.remedy}; if they are right as they are, pass {CHANNELS_AS_WIRED}"
-            raise ChannelsExchanged(subject, found=found.found, expected=found.expected, remedy=remedy)
-
-
-def _exchange_in(logs: Sequence[Path], read: ReadLog) -> Diagnosis | None:
-    """Whether the currents of some axes are each other's in these logs together."""
-    first, declared = read(logs[0])
-    runs = chain((first,), (read(log)[0] for log in logs[1:]))
-    return exchanged_channels(model_of(declared), runs, declared.conditioning, declared.axis_names)
+    found = exchange_shown_by(explain_channels(runs), cell.axis_names)
+    if found is None:
+        return
+    raise ChannelsExchanged(
+        f"{currents} of {' and '.join(found.axes)}",
+        found=found.found,
+        expected=found.expected,
+        remedy=f"{found.remedy}; if they are right as they are, pass {CHANNELS_AS_WIRED}",
+    )
 
 
 # The description beside the torques

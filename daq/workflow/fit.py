@@ -78,6 +78,7 @@ class Fit:
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
     given_cell: Cell | None = None  #: description that replaces the one in the logs; None where that is used
     diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, with effects of the last one, and of each held-out log
+    is_holdout_judged: bool = False  #: whether the diagnoses are those of held-out logs, too
     #: Slope of each axis's own torque over its current, beside the gains; empty where no log has such torques.
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes all effects that were found, also what held-out runs would refute: these judge none of them.
@@ -111,7 +112,13 @@ class Fit:
     @property
     def recordings(self) -> Recordings:
         """The logs of the fit, for what is looked for in them."""
-        return Recordings(self.logs, self.read, self.identification.estimate.gains_fixed, self.channels_as_wired)
+        return Recordings(
+            self.logs,
+            self.read,
+            self.identification.estimate.gains_fixed,
+            self.channels_as_wired,
+            described=self.cell,
+        )
 
     def evidence(self) -> Evidence:
         """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
@@ -243,7 +250,13 @@ def fit_logs(
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
-    fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell, keep_rows=effects)
+    fitted = fit(
+        list(map(Path, logs)),
+        holdout=list(map(Path, holdout)),
+        cell=cell,
+        keep_rows=effects,
+        judge_holdout=not effects,
+    )
     if effects:
         fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
         check_holdout(fitted)
@@ -260,6 +273,7 @@ def fit(
     lossy: LossyLogs = LossyLogs.REFUSED,
     keep_rows: bool = False,
     channels_as_wired: bool = False,
+    judge_holdout: bool = True,
 ) -> Fit:
     """Identify gains and parameters.
 
@@ -272,6 +286,7 @@ def fit(
         lossy: how to handle logs with losses.
         keep_rows: keep all rows for a search for effects, which then need not read the logs again.
         channels_as_wired: do not look for exchanged currents.
+        judge_holdout: say what is wrong with held-out logs; a search that follows does it with the final model.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
@@ -317,7 +332,8 @@ def fit(
     recordings = Recordings(tuple(logs), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired)
     try:
         with named_causes(recordings):
-            return judged(attempt(logs, holdout, chosen))
+            judged_fit = _with_diagnoses(attempt(logs, holdout, chosen))
+            return _with_holdout_judged(judged_fit) if judge_holdout else judged_fit
     except PayloadUnseen as error:
         hint = contradicting_log(logs, lambda rest: attempt(rest, (), Method.ML))
         raise PayloadUnseen(error.std_percent, error.runs, hint) from error
@@ -341,6 +357,11 @@ def judged(fitted: Fit) -> Fit:
     Raises:
         IdentificationError: a mistake leaves no number that can be used.
     """
+    return _with_holdout_judged(_with_diagnoses(fitted))
+
+
+def _with_diagnoses(fitted: Fit) -> Fit:
+    """Return a fit with what is said of the logs that it used, or refuse it; held-out logs are not judged yet."""
     fitted = with_description(fitted)
     of_description = description_diagnoses(fitted)
     recordings = fitted.recordings
@@ -359,12 +380,19 @@ def judged(fitted: Fit) -> Fit:
         fitted = replace(fitted, description=None)  # it rests on a wrong geometry
     else:
         of_fit = (*of_description, *of_fit)
-    calibration = replace(_calibration(fitted), diagnoses=of_fit)
+    return replace(fitted, diagnoses=of_fit, is_holdout_judged=False)
+
+
+def _with_holdout_judged(fitted: Fit) -> Fit:
+    """Return a fit with what is said of its held-out logs behind what is said of the others, unless it has that."""
+    if fitted.is_holdout_judged:
+        return fitted
+    calibration = replace(_calibration(fitted), diagnoses=fitted.diagnoses)
     of_holdout: list[Diagnosis] = []
     for log in fitted.holdout:
         run, described = fitted.read(log)
         of_holdout += diagnose_log(calibration, log, run, described)
-    return replace(fitted, diagnoses=(*of_fit, *of_holdout))
+    return replace(fitted, diagnoses=(*fitted.diagnoses, *of_holdout), is_holdout_judged=True)
 
 
 def with_description(fitted: Fit) -> Fit:
@@ -486,7 +514,7 @@ def close_loop(
         if wrong:  # the fit hoped for a correction of the geometry, and the search made none
             raise EffectImpossible(f"the declared {wrong}")
         if closed.estimate is described and not open_correction_diagnoses(closed.steps, closed.cell):
-            return closed
+            return _with_holdout_judged(closed)
         return judged(closed)
 
 

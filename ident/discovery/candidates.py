@@ -12,8 +12,9 @@ directions, gains included, and measures what they explain of the residual: in-s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,7 @@ ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 Felt = Mapping[int, FloatArray]  #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
 
 BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small
+DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
@@ -94,8 +96,16 @@ class SearchProblem:
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[CandidateTrial | None, ...]:
         """Test candidates given by their joint torques (m, p, r); None where the model contains them already."""
+        return _scored(self.folds, self._felt(torques))
+
+    def _felt(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, Felt]]:
+        """Number of columns of each candidate, and its whitened columns; some are decorrelated at once."""
         problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
-        return _scored(self.folds, ((torque.shape[1], problem.felt(torque, to_motor)) for torque in torques))
+        # One torque after the other is in memory: it is far larger than what single motors feel of it.
+        whitened = ((torque.shape[1], problem.whitened_by_motor(torque, to_motor)) for torque in torques)
+        while together := list(islice(whitened, DECORRELATED_TOGETHER)):
+            widths, felt = zip(*together, strict=True)
+            yield from zip(widths, problem.decorrelated_by_motor(felt), strict=True)
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
         """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""

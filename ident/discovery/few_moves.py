@@ -90,17 +90,23 @@ def without_most_leverage(
         projected: Φ⊥ᵀΦ⊥ of each cluster on all rows, shape (clusters, p, p).
     """
     share = np.einsum("mpq,qp->m", projected, np.linalg.pinv(projected.sum(axis=0)))
-    left = np.sort(np.argsort(share)[:-LEVERAGE])
-    hessian = folds.cluster_hessian[left].sum(axis=0)
-    diagonal = np.diag(folds.cluster_hessian.sum(axis=0))
-    factor = linalg.cho_factor(hessian + RIDGE * np.diag(diagonal), lower=True)
+    order = np.argsort(share)
+    left = np.sort(order[:-LEVERAGE])
+    clusters, unknowns, _ = folds.cluster_hessian.shape
+    whole_hessian = folds.cluster_hessian.sum(axis=0)
+    hessian = whole_hessian - folds.cluster_hessian[order[-LEVERAGE:]].sum(axis=0)
+    factor = linalg.cho_factor(hessian + RIDGE * np.diag(np.diag(whole_hessian)), lower=True)
     along = linalg.cho_solve(factor, crossed[left].sum(axis=0).T)
     step = linalg.cho_solve(factor, folds.cluster_score[left].sum(axis=0))
-    pushed = folds.cluster_hessian[left] @ along
+    # H_m w and H_m x of every cluster by one product, which is far faster than a product for each.
+    all_pushed = folds.cluster_hessian.reshape(-1, unknowns) @ np.column_stack((along, step))
+    of_cluster = all_pushed.reshape(clusters, unknowns, -1)[left]
+    pushed = of_cluster[:, :, :-1]
+    pushed_step = of_cluster[:, :, -1]
     beside = crossed[left] @ along
-    gram = squares[left] - beside - np.swapaxes(beside, 1, 2) + np.einsum("fp,mfq->mpq", along, pushed)
+    gram = squares[left] - beside - np.swapaxes(beside, 1, 2) + along.T @ pushed
     own_score = scores[left] - crossed[left] @ step
-    declared_score = folds.cluster_score[left] - folds.cluster_hessian[left] @ step
+    declared_score = folds.cluster_score[left] - pushed_step
     score = own_score - declared_score @ along
     whole = gram.sum(axis=0)
     if np.any(np.diag(whole) < SHARE * np.diag(projected.sum(axis=0))):

@@ -129,25 +129,43 @@ class Linearisation:
             torque_nm: per unit of each column.
             to_motor: T (DriveTrain.to_motor).
         """
+        return self.decorrelated_by_motor([self.whitened_by_motor(torque_nm, to_motor)])[0]
+
+    def whitened_by_motor(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
+        """The same with what runs share still in the columns; see `decorrelated_by_motor`."""
         felt: dict[int, FloatArray] = {}
         if self.transform is not None:
             for motor in range(len(self.gamma)):
                 source = self.source[self.rows_of(motor)]
                 torque = torque_nm.take(source, axis=2)
                 felt[motor] = np.einsum("rj,jer->er", self.transform[source, motor], torque)
-            return self._decorrelated(felt)
+            return felt
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
                 own = torque_nm[joint].take(self.source[self.rows_of(motor)], axis=1)
                 own *= to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
                 felt[motor] = felt[motor] + own if motor in felt else own
-        return self._decorrelated(felt)
+        return felt
 
-    def _decorrelated(self, felt: dict[int, FloatArray]) -> dict[int, FloatArray]:
-        """Take out of each motor's columns, shape (extra, rows), what its runs share."""
+    def decorrelated_by_motor(self, each: Sequence[dict[int, FloatArray]]) -> list[dict[int, FloatArray]]:
+        """Take out of whitened columns what the rows of a run share; all together, because that is faster.
+
+        Args:
+            each: columns on the rows of each motor that feels any, of some candidates, shapes (extra, rows).
+        """
         if self.scatter is None:
-            return felt
-        return {motor: self.scatter.decorrelate(motor, own) for motor, own in felt.items()}
+            return list(each)
+        found: list[dict[int, FloatArray]] = [{} for _ in each]
+        for motor in range(len(self.gamma)):
+            feeling = [number for number, one in enumerate(each) if motor in one]
+            if not feeling:
+                continue
+            columns = [each[number][motor] for number in feeling]
+            ends = np.cumsum([len(own) for own in columns])
+            parts = np.split(self.scatter.decorrelate(motor, np.concatenate(columns)), ends[:-1])
+            for number, part in zip(feeling, parts, strict=True):
+                found[number][motor] = part
+        return found
 
     def beside_scatter(self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray) -> Linearisation:
         """The same problem where the rows of a run share errors, decorrelated from these; the unknowns stay.

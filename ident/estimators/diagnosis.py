@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -405,7 +405,16 @@ def exchanged_channels(
     """
     if model.is_redundant:  # internal preload is in every current: no motor has an equation without those of the others
         return None
-    evidence = channel_evidence(model, runs, conditioning)
+    return exchange_shown_by(channel_evidence(model, runs, conditioning), axes)
+
+
+def exchange_shown_by(evidence: ChannelEvidence, axes: Sequence[str]) -> Diagnosis | None:
+    """The same from what the equations of the motors explain.
+
+    Args:
+        evidence: of some runs.
+        axes: name of each axis.
+    """
     errors = evidence.errors
     if not np.all((errors > 0.0) & np.isfinite(errors)):
         return None
@@ -511,8 +520,17 @@ class ChannelEvidence:
         return bool(np.mean(falls) > CHANNEL_T * std)
 
 
-def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> ChannelEvidence:
-    """Explain the current of each channel by the equation of each motor.
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelTriangles:
+    """Rows of one run as triangles: the equation of each motor beside the currents of all, in blocks of moves."""
+
+    #: R of each motor's columns and of all currents, by block; None of a block without rows.
+    factors: tuple[tuple[FloatArray | None, ...], ...]
+    row_counts: IntArray  #: rows of each motor, shape (m,)
+
+
+def channel_triangles(model: Model, run: Run, conditioning: Conditioning) -> ChannelTriangles:
+    """Reduce one run to what explains the current of each channel by the equation of each motor.
 
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
@@ -521,34 +539,70 @@ def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioni
     train = model.drive_train
     support = motor_support(train, model.support)
     factors: list[list[FloatArray | None]] = [[None] * CHANNEL_BLOCKS for _ in range(count)]
-    seen = np.zeros(count)
-    for run_number, run in enumerate(runs):
-        data = differentiate(run, model.drive_train, conditioning)
-        for rows in rows_of(model, data, conditioning):
-            block_of_row = (rows.move + run_number) % CHANNEL_BLOCKS
-            for motor, used in enumerate(rows.motor_use):
-                mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
-                payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
-                columns = np.concatenate((mixed[support[motor]], payload, rows.current))
-                for block in np.unique(block_of_row[used]).tolist():
-                    chosen = columns[:, used & (block_of_row == block)]
-                    factors[motor][block] = qr_update(factors[motor][block], chosen)
-                seen[motor] += np.count_nonzero(used)
+    row_counts = np.zeros(count, dtype=np.int64)
+    data = differentiate(run, train, conditioning)
+    for rows in rows_of(model, data, conditioning):
+        block_of_row = rows.move % CHANNEL_BLOCKS
+        for motor, used in enumerate(rows.motor_use):
+            mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
+            payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
+            columns = np.concatenate((mixed[support[motor]], payload, rows.current))
+            for block in np.unique(block_of_row[used]).tolist():
+                chosen = columns[:, used & (block_of_row == block)]
+                factors[motor][block] = qr_update(factors[motor][block], chosen)
+            row_counts[motor] += np.count_nonzero(used)
+    return ChannelTriangles(tuple(map(tuple, factors)), row_counts)
+
+
+def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> ChannelEvidence:
+    """Explain the current of each channel by the equation of each motor.
+
+    Raises:
+        DataUnfit: as of `ident.equations.reduction.reduce_runs`.
+    """
+    return explain_channels([channel_triangles(model, run, conditioning) for run in runs])
+
+
+def explain_channels(runs: Sequence[ChannelTriangles]) -> ChannelEvidence:
+    """The same from runs that are reduced already.
+
+    Args:
+        runs: of one robot, at least one.
+    """
+    count = len(runs[0].row_counts)
+    row_counts = np.sum([run.row_counts for run in runs], axis=0)
     errors = np.full((count, count), np.nan)
     shares = np.zeros((CHANNEL_BLOCKS, count, count))
-    for motor, of_motor in enumerate(factors):
-        blocks = {number: factor for number, factor in enumerate(of_motor) if factor is not None}
+    for motor in range(count):
+        blocks = _joined_blocks([run.factors[motor] for run in runs])
         if not blocks:
             continue
         whole = triangle(blocks.values(), next(iter(blocks.values())).shape[1])
-        if seen[motor] <= whole.shape[1]:
+        if row_counts[motor] <= whole.shape[1]:
             continue
         first = whole.shape[1] - count
         size = np.linalg.norm(whole[:, first:], axis=0)
         errors[motor] = np.linalg.norm(whole[first:, first:], axis=0) / size
-        errors[motor] *= np.sqrt(seen[motor] / (seen[motor] - first))
+        errors[motor] *= np.sqrt(row_counts[motor] / (row_counts[motor] - first))
         explained = scipy.linalg.lstsq(whole[:first, :first], whole[:first, first:])[0]
         for number, factor in blocks.items():
             left = factor[:, first:] - factor[:, :first] @ explained
             shares[number, motor] = np.sum(left**2, axis=0) / size**2
     return ChannelEvidence(errors, shares)
+
+
+def _joined_blocks(factors: Sequence[Sequence[FloatArray | None]]) -> dict[int, FloatArray]:
+    """Triangle of each block of one motor, from its triangles in each run.
+
+    The runs of a session begin alike: the first block of the next run is the second one of all.
+    """
+    parts: dict[int, list[FloatArray]] = {}
+    for run_number, of_run in enumerate(factors):
+        for block, factor in enumerate(of_run):
+            if factor is not None:
+                parts.setdefault((block + run_number) % CHANNEL_BLOCKS, []).append(factor)
+    joined: dict[int, FloatArray] = {}
+    for block in sorted(parts):
+        own = parts[block]
+        joined[block] = own[0] if len(own) == 1 else triangle(own, own[0].shape[1])
+    return joined
