@@ -19,8 +19,9 @@ from ident.arrays import BoolArray, FloatArray
 from ident.data.dataset import Dataset
 from ident.effects.effect import Effect, GearSide, PlacedEffect, Property
 from ident.effects.signals import Abscissa, Arm, Signals
+from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, with_geometry
 from ident.model.model import Column, Model
-from ident.model.robot import JointKind, Motion, Robot, skew
+from ident.model.robot import Motion, Robot, skew
 
 POSITION_STEP = 1e-5  #: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
 TIME_STEP_S = 1e-5  #: The same of a delay
@@ -92,14 +93,8 @@ class ZeroOffset(GeometryEffect):
 
     def correct_robot(self, robot: Robot, axis: int) -> Robot:
         """Turn or shift the frame of the joint, so that its recorded position means what it should."""
-        number = robot.axis_joints[axis]
-        joint = robot.joints[number]
-        if joint.kind is JointKind.REVOLUTE:
-            moved = replace(joint, rotation=joint.rotation @ rotation_by(self.applied_rad * joint.axis))
-        else:
-            moved = replace(joint, translation_m=joint.translation_m + self.applied_rad * joint.rotation @ joint.axis)
-        joints = (*robot.joints[:number], moved, *robot.joints[number + 1 :])
-        return replace(robot, joints=joints)
+        zero = GeometryParameter(GeometryKind.ZERO, robot.axes[axis].name)
+        return with_geometry(robot, (GeometryChange(zero, self.applied_rad),))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""

@@ -1,10 +1,12 @@
-"""A redundant drive whose zero or rod is not as described, over the whole driver path: what `fit` and `residual` say.
+"""A closed chain whose zero or rod is not as described, over the whole driver path: what `fit` and `residual` say.
 
     python -m tests.studies.chain_geometry --seeds 1
+    python -m tests.studies.chain_geometry --robot five-bar
 
-The plant of the DualV-like robot is built otherwise than its cell file says, so that its drives work against each other
-as those of such a robot do. Prints the errors of the gains, σ, the misfit and the corrections of each case; the first
-one is the clean cell.
+The plant is built otherwise than its cell file says. The encoders of the redundant DualV-like robot contradict each
+other then, and its drives work against each other; the five-bar has as many encoders as degrees of freedom, and shows
+it in its torques alone. Prints the errors of the gains, σ, the misfit and the corrections of each case; the first one
+is the clean cell.
 """
 
 from __future__ import annotations
@@ -64,11 +66,15 @@ class WrongGeometry:
         return replace(spec, urdf=urdf, start_rad=start_rad)
 
 
-CASES = (
-    None,
-    *(WrongGeometry("crank-2", zero_deg=size) for size in (0.05, 0.1, 0.5)),
-    *(WrongGeometry("tip-3", longer_percent=size) for size in (0.1, 0.3, 1.0)),
-)
+ROD_ENDS = {"dualv": "tip-3", "five-bar": "tip-2"}
+"""Fixed joint at the end of the rod that is longer, of each robot that is studied."""
+
+
+def cases_of(robot: str) -> tuple[WrongGeometry | None, ...]:
+    """The clean cell, wrong zeros and wrong rods."""
+    zeros = (WrongGeometry("crank-2", zero_deg=size) for size in (0.05, 0.1, 0.5))
+    rods = (WrongGeometry(ROD_ENDS[robot], longer_percent=size) for size in (0.1, 0.3, 1.0))
+    return (None, *zeros, *rods)
 
 
 def study_case(job: Job, wrong: WrongGeometry | None, seed: int, verb: str) -> dict[str, Any]:
@@ -99,31 +105,35 @@ def row(job: Job, found: dict[str, Any]) -> str:
     errors = np.array([100.0 * (gain["value"] / job.truth[gain["axis"]] - 1.0) for gain in gains])
     std = np.array([100.0 * gain["std"] / abs(job.truth[gain["axis"]]) for gain in gains])
     misfit = found["encoder_misfit"]
-    named = [
-        f"{one['kind']} {one['joint']} {one['end']} {one['change']:+.7f} ± {one['std']:.7f} {one['unit']}"
-        for one in misfit["corrections"]
-    ]
+    encoders = "no encoder beyond the degrees of freedom"
+    if misfit is not None:
+        named = [
+            f"{one['kind']} {one['joint']} {one['end']} {one['change']:+.7f} ± {one['std']:.7f} {one['unit']}"
+            for one in misfit["corrections"]
+        ]
+        encoders = f"misfit {misfit['described']:.1e} → {misfit['left']:.1e}, {'; '.join(named) or 'nothing named'}"
     effects = [f"{one['name']} on {one['axis']}" for one in found["effects"]]
+    diagnoses = [f"{one['name']}: {one['found']}" for one in found["diagnoses"]]
     return (
-        f"errors {np.round(errors, 2)} σ {np.round(std, 2)} largest z {np.max(np.abs(errors / std)):.1f}, misfit "
-        f"{misfit['described']:.1e} → {misfit['left']:.1e}, {'; '.join(named) or 'nothing named'}; effects "
-        f"{', '.join(effects) or 'none'}; diagnoses {', '.join(one['name'] for one in found['diagnoses']) or 'none'}"
+        f"errors {np.round(errors, 2)} σ {np.round(std, 2)} largest z {np.max(np.abs(errors / std)):.1f}, {encoders}; "
+        f"effects {', '.join(effects) or 'none'}; diagnoses {'; '.join(diagnoses) or 'none'}"
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Study every case with plans and noise of each seed."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.chain_geometry", description=__doc__)
+    parser.add_argument("--robot", choices=ROD_ENDS, default="dualv")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--verbs", nargs="+", choices=["fit", "residual"], default=["fit", "residual"])
     options = parser.parse_args(arguments)
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
-            job, _ = record_job("dualv", Path(folder), seconds=options.seconds, pairs=0, seed=seed, noise=NOISE)
+            job, _ = record_job(options.robot, Path(folder), seconds=options.seconds, pairs=0, seed=seed, noise=NOISE)
             with contextlib.redirect_stdout(io.StringIO()):
                 make_plan(job, "plan.yaml", seed=10 * seed, seconds=options.seconds, exchanges=50)
-            for wrong in CASES:
+            for wrong in cases_of(options.robot):
                 for verb in options.verbs:
                     sys.stdout.write(f"{seed} {verb} {wrong}: {row(job, study_case(job, wrong, seed, verb))}\n")
                     sys.stdout.flush()
