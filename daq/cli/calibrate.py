@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+import termios
 import webbrowser
+from array import array
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from fcntl import ioctl
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -154,9 +157,14 @@ def tell(text: str, *, bold: bool = False) -> None:
 def ask(question: str) -> str:
     """Ask the operator; return the answer without spaces.
 
+    Only what is typed at a terminal behind the question answers it: a key that was pressed too often before
+    must not start the robot.
+
     Raises:
         JobHeld: the input has ended.
     """
+    if _discard_typed_ahead():
+        tell("What was typed before this question does not count.")
     typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
     answer = sys.stdin.readline()
     if not answer:
@@ -168,6 +176,19 @@ def ask(question: str) -> str:
             remedy="start the same command in a terminal; the session goes on where it is",
         )
     return answer.strip()
+
+
+def _discard_typed_ahead() -> bool:
+    """Discard what waits in the terminal's input; return whether a whole line did.
+
+    The lines of a pipe stay: a script writes its answers before it is asked.
+    """
+    if not sys.stdin.isatty():
+        return False
+    waiting_bytes = array("i", [0])
+    ioctl(sys.stdin, termios.FIONREAD, waiting_bytes)
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    return waiting_bytes[0] > 0
 
 
 def open_page(page: Path) -> None:
