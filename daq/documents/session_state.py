@@ -203,6 +203,7 @@ class GuidedState(SessionState):
     blocks: tuple[Block, ...] = ()
     mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
     rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
+    bare_first: Annotated[int, Field(ge=1)] = 1  #: number of bare blocks before the first one with the payload
     gains: tuple[GainSoFar, ...] = ()  #: after the last block that was judged
     judged_blocks: _Count = 0  #: number of blocks behind these gains
     progress: tuple[Progress, ...] = ()  #: after each block that was judged

@@ -1,15 +1,14 @@
 """Which block comes next in a guided session: without load, or with the payload.
 
-The first three are bare, loaded, and loaded once more, held out. What follows depends on the model of friction.
-
-With one friction for all blocks, pairs follow in an order that cancels drift: loaded, bare, bare, loaded. The means of
-the bare and of the loaded blocks then lie at the same time, and friction that falls evenly as the arm gets warm is the
-same for both.
+With one friction for all blocks, the first three are bare, loaded, and loaded once more, held out. Pairs follow in an
+order that cancels drift: loaded, bare, bare, loaded. The means of the bare and of the loaded blocks then lie at one
+time, and friction that falls evenly as the arm gets warm is the same for both.
 
 With `friction_by_payload`, a change of friction between bare and loaded blocks is no gain, in whatever order they come.
-So the order is the one that takes a person the least time, and a change of the payload takes minutes. Gains are seen by
-the difference of bare and loaded blocks: of n and k of them, σ² of a gain falls as 1/n + 1/k. Where the time of the
-session is too short for the target, the order is the one that leaves σ smallest at its end.
+So the order is the one that takes a person the least time, and a change of the payload takes minutes. All bare blocks
+that the target needs by the plan come first; then the payload stays on. Gains are seen by the difference of bare and
+loaded blocks: of n and k of them, σ² of a gain falls as 1/n + 1/k. Where the time of the session is too short for the
+target, the order is the one that leaves σ smallest at its end.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ class BlockRole(Enum):
 
 FIRST_BLOCKS = (BlockRole.BARE, BlockRole.LOADED, BlockRole.HELD_OUT)
 NEXT_BLOCKS = (BlockRole.LOADED, BlockRole.BARE, BlockRole.BARE, BlockRole.LOADED)
+MOST_BARE_FIRST = 6
+"""Bare blocks before the first loaded one at most: what a plan predicts is only a prediction."""
 CHANGE_S = 180.0  #: Time of a person to change the payload [s]
 ROUNDING = 1e-9  #: Relative
 FAR = 4000  #: Blocks that no session has
@@ -41,6 +42,25 @@ class BlocksSoFar:
     bare: int
     loaded: int
     is_mounted: bool  #: whether the last block carried the payload
+
+
+def first_blocks(bare: int) -> tuple[BlockRole, ...]:
+    """Return the blocks with which every session begins: so many bare ones, then a loaded one, and one held out."""
+    return (*(BlockRole.BARE,) * bare, *FIRST_BLOCKS[1:])
+
+
+def bare_blocks_first(variance_ratio: float) -> int:
+    """Return how many bare blocks to record before the payload is mounted, at least one.
+
+    Of n bare and as many loaded blocks, σ² is that of one of each over n. One bare block too many costs its time; with
+    one too few the payload comes off again, which takes longer.
+
+    Args:
+        variance_ratio: predicted σ² of the worst gain over that of its target, with one bare and one loaded block.
+    """
+    if not math.isfinite(variance_ratio):
+        return MOST_BARE_FIRST
+    return min(max(1, math.ceil(variance_ratio - ROUNDING)), MOST_BARE_FIRST)
 
 
 def fixed_role(number: int) -> BlockRole:

@@ -1,7 +1,7 @@
 """The schedule of a guided session: short blocks, bare and loaded, until every gain is precise.
 
-The first three blocks are bare, loaded, and loaded again but held out: with these, gains and their σ are known, and one
-change of the payload is enough. `block_order` says which kind comes next.
+The first blocks are bare, then one is loaded, and one loaded but held out: with these, gains and their σ are known, and
+one change of the payload is enough. `block_order` says how many are bare, and which kind comes next.
 
 The moves of the first three blocks are for all gains. Those of every later block are for the gain that is farthest from
 its target by then, inside the room and the speed of the first three, which the operator has looked at.
@@ -25,7 +25,16 @@ from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
 from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, writing
 from daq.jobs.block_check import compared_with, mistake_in
-from daq.jobs.block_order import FIRST_BLOCKS, BlockRole, BlocksSoFar, fixed_role, next_role, quickest_way
+from daq.jobs.block_order import (
+    FIRST_BLOCKS,
+    BlockRole,
+    BlocksSoFar,
+    bare_blocks_first,
+    first_blocks,
+    fixed_role,
+    next_role,
+    quickest_way,
+)
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, move_without_log
@@ -113,6 +122,7 @@ class UntilPrecise:
         require_same_cell(context)
         number = _next_number(state)
         role = self._role_of(context, state, state.gains, number)
+        name = name_of(number, role)
         payload = None
         mass_kg = None
         if role is not BlockRole.BARE:
@@ -120,7 +130,7 @@ class UntilPrecise:
             mass_kg = state.mass_kg or context.operator.weigh(payload)
             session = session.update(mass_kg=mass_kg)
         block = Block(
-            name=name_of(number, role),
+            name=name,
             payload=payload,
             mass_kg=mass_kg,
             holdout=role is BlockRole.HELD_OUT,
@@ -128,10 +138,11 @@ class UntilPrecise:
         )
         path = session.folder / block.plan
         if number < len(FIRST_BLOCKS):
-            plan = self.plan_block(context, number, path)
+            plan = self.plan_block(context, name, number, path)
+            session = session.update(bare_first=self._bare_first(context, state, plan, number))
         else:
             plan = self._later_plan(context, session, number, path)
-            say_moves(context, block.name, path)
+            say_moves(context, name, path)
         # In the place of one that is recorded again.
         blocks = (*state.blocks[:number], block, *state.blocks[number:])
         session = session.update(blocks=blocks)
@@ -148,8 +159,12 @@ class UntilPrecise:
             gains: by these blocks; empty where they are not known yet.
             number: of the block, from 0.
         """
-        is_one_of_first = number < len(FIRST_BLOCKS)
-        if is_one_of_first or not gains or not context.cell.friction_by_payload:
+        if not context.cell.friction_by_payload:
+            return fixed_role(number)
+        first = first_blocks(state.bare_first)
+        if number < len(first):
+            return first[number]
+        if not gains:
             return fixed_role(number)
         mounted = {block.name: block.payload is not None for block in state.blocks}
         recorded = [run.name for run in state.runs if run.name in mounted]
@@ -159,6 +174,14 @@ class UntilPrecise:
         most = max(1, math.floor(until_limit_s / block_s))
         way = quickest_way(so_far, _variance_ratio(gains), block_s, most)
         return next_role(so_far, way)
+
+    def _bare_first(self, context: SessionContext, state: GuidedState, plan: Plan, number: int) -> int:
+        """Return how many bare blocks come before the first one with the payload, by what the first plan predicts."""
+        predicted_percent = plan.predicted_std_percent
+        if number or not context.cell.friction_by_payload or not predicted_percent:
+            return state.bare_first
+        worst = max(predicted_percent) / self.settings.target_percent
+        return bare_blocks_first(worst**2)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
@@ -206,7 +229,7 @@ class UntilPrecise:
         """Judge the gains by all blocks, and plan the next one for the worst gain."""
         state = guided(session)
         recorded = len(state.blocks)
-        if recorded < len(FIRST_BLOCKS) or state.judged_blocks == recorded:
+        if recorded < len(first_blocks(state.bare_first)) or state.judged_blocks == recorded:
             return session
         estimate = self._estimate(context, session)
         gains = estimate.gains
@@ -250,7 +273,7 @@ class UntilPrecise:
         """Plan the next block for the worst gain; nothing is planned where the gains are not known yet."""
         outlook = estimate.outlook
         number = _next_number(guided(session))
-        if outlook is None or number < len(FIRST_BLOCKS):
+        if outlook is None or number < len(first_blocks(guided(session).bare_first)):
             return
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
@@ -320,9 +343,8 @@ class UntilPrecise:
             )
         return accepted_room(context.cell, experiment.scene, plans)
 
-    def plan_block(self, context: SessionContext, number: int, path: Path) -> Plan:
-        """Make the moves of one of the first blocks by its number from 0."""
-        name = name_of(number, FIRST_BLOCKS[number])
+    def plan_block(self, context: SessionContext, name: str, number: int, path: Path) -> Plan:
+        """Make the moves of one of the first blocks by its name, and its number from 0."""
         return plan_moves(context, name, path, self.settings.seed + number, self.settings.block_s)
 
     def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
@@ -372,8 +394,9 @@ class Rehearse:
         before_motion(context)
         for number in range(guided(session).rehearsed, len(FIRST_BLOCKS)):
             path = session.folder / plan_name(number)
-            plan = slowed(context.cell, self.schedule.plan_block(context, number, path), self.speed)
             planned = PlannedRun(name=f"rehearsal-{number + 1}", plan_file=path)
+            moves = self.schedule.plan_block(context, planned.name, number, path)
+            plan = slowed(context.cell, moves, self.speed)
             context.operator.mount(planned)
             context.journal.say(Level.INFO, "rehearsing", speed=self.speed, seconds=plan.duration_s)
             move_without_log(context, session, NextRun(planned, plan), self.speed)

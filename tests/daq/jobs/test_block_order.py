@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import count, pairwise
+from math import ceil
 
 import pytest
 from hypothesis import given
@@ -12,10 +13,13 @@ from hypothesis import strategies as st
 from daq.jobs.block_order import (
     CHANGE_S,
     FIRST_BLOCKS,
+    MOST_BARE_FIRST,
     NEXT_BLOCKS,
     ROUNDING,
     BlockRole,
     BlocksSoFar,
+    bare_blocks_first,
+    first_blocks,
     fixed_role,
     next_role,
     quickest_way,
@@ -134,3 +138,29 @@ def test_what_is_left_shrinks_by_each_block(first_ratio: float) -> None:
     target = _variance(AFTER_THREE) / first_ratio
     left = [quickest_way(one, _variance(one) / target, BLOCK_S).count for one in steps[:-1]]
     assert left == list(range(len(steps) - 1, 0, -1))
+
+
+@given(st.floats(0.01, float(MOST_BARE_FIRST)))
+def test_where_the_prediction_is_right_the_payload_is_mounted_once(ratio: float) -> None:
+    """σ² of n bare and n loaded blocks is that of one of each over n."""
+    roles = first_blocks(bare_blocks_first(ratio))
+    bare = roles.count(BlockRole.BARE)
+    assert bare == max(1, ceil(ratio - ROUNDING))
+    so_far = BlocksSoFar(bare=bare, loaded=1, is_mounted=True)
+    target = 2.0 / ratio
+    while _variance(so_far) > target * (1.0 + ROUNDING):
+        way = quickest_way(so_far, _variance(so_far) / target, BLOCK_S)
+        role = next_role(so_far, way)
+        assert role is BlockRole.LOADED
+        so_far = _with_one_more(so_far, role)
+    assert so_far.loaded <= bare
+
+
+@pytest.mark.parametrize("ratio", [50.0, float("inf"), float("nan")])
+def test_a_prediction_that_is_far_off_costs_a_few_blocks_at_most(ratio: float) -> None:
+    assert bare_blocks_first(ratio) == MOST_BARE_FIRST
+
+
+def test_every_session_begins_with_what_gives_the_gains() -> None:
+    assert first_blocks(1) == FIRST_BLOCKS
+    assert first_blocks(3) == (BlockRole.BARE, BlockRole.BARE, *FIRST_BLOCKS)
