@@ -44,7 +44,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
-from ident.discovery.geometry_check import GeometryCheck, check_geometry
+from ident.discovery.geometry_check import GeometryCheck, check_geometry, placed_of
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.discovery.loop import Step
 from ident.discovery.search import Finding
@@ -421,9 +421,10 @@ def _beside_alike(
         cell: whose description it is.
         model: as declared.
     """
-    other_findings = [one for one in check.alike if PlacedEffect(one.effect, one.axis) != placed]
-    if len(other_findings) == len(check.alike):  # it is not among them
+    alike = next((one for one in check.alike if one.contain(placed)), None)
+    if alike is None:
         return diagnosis
+    other_findings = [one for one in alike.findings if placed_of(one) != placed]
     named = (diagnosis, *(_finding_diagnosis(one, cell, model) for one in other_findings))
     found = " or ".join(one.found for one in named)
     expected = dict.fromkeys(one.expected for one in named)
@@ -431,9 +432,9 @@ def _beside_alike(
     for one in named:
         axes |= dict.fromkeys(one.axes)
     wanted = "moves at other speeds and in other poses"
-    if check.axes_to_move:
-        names = " and ".join(cell.place_names[axis] for axis in check.axes_to_move)
-        verb = "turns" if len(check.axes_to_move) == 1 else "turn"
+    if alike.axes_to_move:
+        names = " and ".join(cell.place_names[axis] for axis in alike.axes_to_move)
+        verb = "turns" if len(alike.axes_to_move) == 1 else "turn"
         wanted = f"moves in which {names} {verb} further"
     return replace(
         diagnosis,

@@ -45,7 +45,7 @@ from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
 from ident.discovery.before_after import error_on
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
-from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.geometry_check import GeometryCheck, placed_of
 from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
@@ -407,22 +407,22 @@ def with_description(fitted: Fit) -> Fit:
 
 
 def _with_description_after_search(closed: Fit) -> Fit:
-    """Keep the mistake that the fit before a search has named, unless the search has explained it.
+    """Keep the mistakes that the fit before a search has named, unless the search has explained them.
 
-    It is explained by a correction, or by effects beside which the same test names it no more.
+    They are explained by corrections, or by effects beside which the same test names them no more.
     """
     description = closed.description
-    if description is None or description.mistake is None:
+    if description is None or not description.mistakes:
         return closed
     after = closed.steps[-1].after
-    if PlacedEffect(description.mistake.effect, description.mistake.axis) in after.effects:
-        return replace(closed, description=replace(description, mistake=None))
-    if len(after.effects) == after.declared:  # the model is the one beside which it was named
+    if all(placed_of(mistake) in after.effects for mistake in description.mistakes):
+        return replace(closed, description=replace(description, mistakes=()))
+    if len(after.effects) == after.declared:  # the model is the one beside which they were named
         return closed
     beside = geometry_beside(after, BOOTSTRAP_SEED)
     if beside is None:
-        return replace(closed, description=replace(description, mistake=None))
-    # Gravity and hidden zeros stay those of the fit; the mistake and its company are those of the final model.
+        return replace(closed, description=replace(description, mistakes=()))
+    # Gravity and hidden zeros stay those of the fit; mistakes and their company are those of the final model.
     kept = replace(beside, gravity=description.gravity, hidden_zeros=description.hidden_zeros)
     return replace(closed, description=kept)
 

@@ -5,6 +5,9 @@ Zeros of joints, the direction of gravity, late positions and late currents are 
 more of what is left out than each named effect of one axis does, or most of it beside the best of these: a spring that
 the model lacks explains a part of what a wrong zero does, and friction that it lacks on another axis does not. What is
 left is fitted together with everything else, and must pass by the σ of that fit, which is the one that is reported.
+
+Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of the other. So the
+test is repeated beside what it has found until it finds nothing more, and all numbers are those of one fit together.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from ident.effects.geometry_corrections import (
 )
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
+from ident.errors import TooFewMoves
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
@@ -47,6 +51,7 @@ CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one
 SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
 SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
 LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
+MOST_ROUNDS = 4  #: Tests one after the other, each beside the mistakes that were found before
 LEAST_SETTLED_STD = 0.1
 """Least σ of a correction in the joint fit, in that of its column. Where gravity leans and a joint hardly moves, a base
 parameter of the corrected robot is the same column as the turn itself, and leaves it a σ of rounding errors."""
@@ -64,22 +69,45 @@ class Gravity:
 
 
 @dataclass(frozen=True, slots=True)
+class AlikeCorrections:
+    """Corrections of which the data show that one is needed, and not which."""
+
+    findings: tuple[Finding, ...]  #: the mistake that was found, then those that explain the same; at least two
+    axes_to_move: tuple[int, ...]  #: axes that must turn further, so that other data tell these apart
+
+    def contain(self, placed: PlacedEffect) -> bool:
+        """Whether a correction is one of them."""
+        return any(placed_of(found) == placed for found in self.findings)
+
+
+@dataclass(frozen=True, slots=True)
 class GeometryCheck:
     """What a fit says of the description of its robot, and of the clock of its recordings."""
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
-    #: The correction of the description or of the clock that the data ask for; None where they ask for none.
-    mistake: Finding | None
+    #: Corrections of the description and of the clock that the data ask for, by one fit of all of them.
+    mistakes: tuple[Finding, ...]
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
-    also_late: tuple[Finding, ...] = ()  #: the other late currents, where the mistake is one of several
-    #: The mistake and the corrections that the data do not tell apart from it; empty where the mistake stands alone.
-    alike: tuple[Finding, ...] = ()
-    axes_to_move: tuple[int, ...] = ()  #: axes that must turn further, so that other data tell these apart
+    alike: tuple[AlikeCorrections, ...] = ()  #: of each mistake that does not stand alone
 
-    @property
-    def mistakes(self) -> tuple[Finding, ...]:
-        """The mistake, with the other currents that are late where it is one."""
-        return () if self.mistake is None else (self.mistake, *self.also_late)
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """One test beside what earlier tests have found."""
+
+    evidence: Evidence  #: beside which it was made
+    problem: SearchProblem
+    findings: tuple[Finding, ...]  #: of all corrections, the best first
+    mistakes: tuple[Finding, ...]  #: what it has found
+    corrected: Evidence | None  #: fitted with these; None without any
+
+
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """Mistakes by the fit that has them in its model."""
+
+    mistakes: tuple[Finding, ...]
+    corrected: Evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,51 +172,128 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     """
     # What the arm does wrong is spread over all motors, and a delay is judged by its length.
     gates = replace(gates or Gates(), explained=0.0, error_fall=0.0)
+    first = _tested_once(evidence, rng, gates)
+    rounds = [first]
+    while len(rounds) < MOST_ROUNDS:
+        corrected = rounds[-1].corrected
+        if corrected is None:
+            break
+        try:
+            rounds.append(_tested_once(corrected, rng, gates))
+        except TooFewMoves:  # of the corrected description, other moves may be valid
+            break
+    mistakes = _in_one_fit(rounds)
+    return GeometryCheck(
+        gravity=_gravity(evidence, first.problem),
+        mistakes=mistakes,
+        hidden_zeros=_hidden_zeros(first.findings, evidence.model.robot),
+        alike=_all_alike(evidence, rounds, mistakes, rng, gates),
+    )
+
+
+def placed_of(found: Finding) -> PlacedEffect:
+    """The effect of a finding on its axis."""
+    return PlacedEffect(found.effect, found.axis)
+
+
+def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> _Round:
+    """Test geometry and clock once; what the model has in it already is not tested.
+
+    Raises:
+        TooFewMoves: there are too few moves to leave some out.
+    """
     problem = _problem_at_rows(evidence)
     of_geometry = _tested(problem, GEOMETRY)
     screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
     findings = rank_families(problem, screened, rng, gates)
-    mistakes: tuple[Finding, ...] = ()
-    if any(found.passed for found in findings):
-        rates_nm_s = torque_rates(evidence)
-        of_currents = try_delays(problem, rates_nm_s)
-        tested = (*of_geometry, *of_currents)
-        findings = rank_families(problem, tested, rng, gates)
-        suspects = _suspects(problem, findings, of_currents, rates_nm_s)
-        rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
-        mistakes = _mistakes(evidence, problem, suspects, rivals)
-    robot = evidence.model.robot
-    alike = _alike(evidence, problem, mistakes, findings)
-    return GeometryCheck(
-        gravity=_gravity(evidence, problem),
-        mistake=mistakes[0] if mistakes else None,
-        hidden_zeros=_hidden_zeros(findings, robot),
-        also_late=mistakes[1:],
-        alike=alike,
-        axes_to_move=axes_to_move([PlacedEffect(one.effect, one.axis) for one in alike], robot, evidence.fit_runs),
-    )
+    if not any(found.passed for found in findings):
+        return _Round(evidence, problem, findings, (), None)
+    rates_nm_s = torque_rates(evidence)
+    of_currents = try_delays(problem, rates_nm_s)
+    tested = (*of_geometry, *of_currents)
+    findings = rank_families(problem, tested, rng, gates)
+    suspects = _suspects(problem, findings, of_currents, rates_nm_s)
+    rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
+    settled = _first_that_stands(evidence, problem, suspects, rivals)
+    if settled is None:
+        return _Round(evidence, problem, findings, (), None)
+    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected)
 
 
-def _alike(
-    evidence: Evidence, problem: SearchProblem, mistakes: Sequence[Finding], findings: Sequence[Finding]
-) -> tuple[Finding, ...]:
-    """The mistake and the corrections that the data do not tell apart from it; empty where it stands alone."""
-    if not mistakes or not isinstance(mistakes[0].effect, GeometryEffect):
-        return ()
-    mistake = mistakes[0]
-    corrections = [found for found in findings if isinstance(found.effect, GeometryEffect)]
+def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
+    """The mistakes of all rounds with values and σ of the fit that has all of them; those that it shows."""
+    found: list[Finding] = []
+    fitted: Evidence | None = None
+    for tested in rounds:
+        found += tested.mistakes
+        fitted = tested.corrected or fitted
+    if fitted is None or len(found) == len(rounds[0].mistakes):
+        return tuple(found)
+    shown: list[Finding] = []
+    for one in found:
+        placed = placed_of(one)
+        if placed not in fitted.effects:
+            continue
+        values, deviations = coefficients_of(fitted.estimate, placed)
+        # What an earlier round found may have been a part of what a later one found.
+        if not in_noise(values, _covariance_of(fitted.estimate, placed), SHOWN):
+            shown.append(replace(one, coefficients=values, deviations=deviations))
+    return tuple(shown)
+
+
+def _all_alike(
+    evidence: Evidence, rounds: Sequence[_Round], mistakes: Sequence[Finding], rng: np.random.Generator, gates: Gates
+) -> tuple[AlikeCorrections, ...]:
+    """For each correction of the description, those that the data do not tell apart from it beside all others."""
+    found: list[AlikeCorrections] = []
+    for mistake in mistakes:
+        if not isinstance(mistake.effect, GeometryEffect):
+            continue
+        others = tuple(placed_of(one) for one in mistakes if one is not mistake)
+        if not others:
+            beside = rounds[0]
+        else:
+            try:
+                beside = _ranked_beside(evidence, others, rng, gates)
+            except UNFITTED:
+                continue
+        alike = _alike(beside, mistake)
+        if alike:
+            axes = axes_to_move([placed_of(one) for one in alike], evidence.model.robot, evidence.fit_runs)
+            found.append(AlikeCorrections(alike, axes))
+    return tuple(found)
+
+
+def _ranked_beside(
+    evidence: Evidence, others: tuple[PlacedEffect, ...], rng: np.random.Generator, gates: Gates
+) -> _Round:
+    """All corrections ranked beside some mistakes.
+
+    Raises:
+        NotConverged, RankDeficient: see `ident.identify`.
+    """
+    beside = with_effects(evidence, (*evidence.effects, *others))
+    problem = _problem_at_rows(beside)
+    findings = rank_families(problem, _tested(problem, GEOMETRY), rng, gates)
+    return _Round(beside, problem, findings, (), None)
+
+
+def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
+    """A mistake and the corrections that the data do not tell apart from it; empty where it stands alone."""
+    corrections = [found for found in beside.findings if isinstance(found.effect, GeometryEffect)]
     # As it was ranked among the corrections: its ambiguity names those that folds do not distinguish from it.
-    (as_found,) = (one for one in corrections if (one.effect.name, one.axis) == (mistake.effect.name, mistake.axis))
-    others = alike_corrections(problem, as_found, corrections)
+    as_found = next((one for one in corrections if placed_of(one) == placed_of(mistake)), None)
+    if as_found is None:
+        return ()
+    others = alike_corrections(beside.problem, as_found, corrections)
     if not others:
         return ()
     alike = [mistake]
     for other in others:
-        placed = PlacedEffect(other.effect, other.axis)
-        torque_nm = problem.torque_at_rows(other.effect, other.axis)
-        suspect = _Suspect((placed,), torque_nm, other.coefficients, other.held_out_fall)
-        settled = _settled(evidence, suspect, (other,))
-        alike.append(settled[0] if settled else other)
+        torque_nm = beside.problem.torque_at_rows(other.effect, other.axis)
+        suspect = _Suspect((placed_of(other),), torque_nm, other.coefficients, other.held_out_fall)
+        settled = _settled(beside.evidence, suspect, (other,))
+        alike.append(other if settled is None else settled.mistakes[0])
     return tuple(alike)
 
 
@@ -207,9 +312,8 @@ def _suspects(
     passed = [found for found in findings if found.passed]
     for found in passed:
         if not isinstance(found.effect, (Lag, TimeSkew)):
-            placed = PlacedEffect(found.effect, found.axis)
             torque_nm = problem.torque_at_rows(found.effect, found.axis)
-            suspects.append(_Suspect((placed,), torque_nm, found.coefficients, found.held_out_fall))
+            suspects.append(_Suspect((placed_of(found),), torque_nm, found.coefficients, found.held_out_fall))
     if any(isinstance(found.effect, CLOCK) for found in passed):
         late = find_late_currents(problem, of_currents, rates_nm_s)
         if late is not None:
@@ -245,10 +349,10 @@ def _rivals(
     return _Rivals(rank_families(problem, (*families, *fast), rng, gates), at_full_rate)
 
 
-def _mistakes(
+def _first_that_stands(
     evidence: Evidence, problem: SearchProblem, suspects: Sequence[_Suspect], rivals: _Rivals
-) -> tuple[Finding, ...]:
-    """The best suspect that stands beside all rivals, and in the joint fit; nothing where none does."""
+) -> _Settled | None:
+    """The best suspect that stands beside all rivals, and in the joint fit; None where none does."""
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
         if not any(found.passed for found in own):
@@ -259,9 +363,9 @@ def _mistakes(
         if not _stands_beside(problem, suspect, own, rivals):
             continue
         settled = _settled(evidence, suspect, own)
-        if settled:
+        if settled is not None:
             return settled
-    return ()
+    return None
 
 
 def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Finding], rivals: _Rivals) -> bool:
@@ -298,8 +402,8 @@ def _is_of_axis(other: Finding, found: Finding) -> bool:
     return is_same and not isinstance(other.effect, GeometryEffect)
 
 
-def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> tuple[Finding, ...]:
-    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct; nothing where it falls.
+def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _Settled | None:
+    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct; None where it falls.
 
     Its column is for small mistakes. The fit must show it by its own σ, within what is possible; and instruments from
     the demanded motion must not show that a disturbance in the position loop looks like it. A mistake without such a
@@ -316,7 +420,7 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> t
         else:
             corrected = with_effects(evidence, (*evidence.effects, *suspect.effects))
     except UNFITTED:
-        return ()
+        return None
     estimate = corrected.estimate
     shown: list[Finding] = []
     for found, placed in zip(own, corrected.effects[-len(own) :], strict=True):
@@ -336,7 +440,7 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> t
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
         shown.append(settled)
-    return tuple(shown)
+    return _Settled(tuple(shown), corrected) if shown else None
 
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:

@@ -31,8 +31,7 @@ def test_a_leaning_base_is_named_and_no_zero(shared_data: Path, tilt_deg: float)
     instants = read_instants(leaning, recording.runs, cell.conditioning)
     assert find_turned_geometry(leaning, instants, gains) is None
     found = identify(leaning, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=gains, judge=False)
-    mistake = check_geometry(gather(found, recording.runs), np.random.default_rng(0)).mistake
-    assert mistake is not None
+    (mistake,) = check_geometry(gather(found, recording.runs), np.random.default_rng(0)).mistakes
     assert isinstance(mistake.effect, GravityDirection)
     turn_deg = np.rad2deg(np.linalg.norm(mistake.coefficients))
     assert turn_deg == pytest.approx(tilt_deg, abs=1.0)

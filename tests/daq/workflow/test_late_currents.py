@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -30,7 +28,7 @@ def _finding(effect: Effect, axis: int, seconds: float) -> Finding:
 
 
 def _checked(*found: Finding) -> GeometryCheck:
-    return GeometryCheck(gravity=None, mistake=found[0], hidden_zeros=(), also_late=found[1:])
+    return GeometryCheck(gravity=None, mistakes=found, hidden_zeros=())
 
 
 def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
@@ -66,11 +64,6 @@ def test_a_late_encoder_asks_for_the_encoder(cell: Cell) -> None:
     assert "what delays this encoder alone" in one.remedy
 
 
-def test_no_mistake_has_no_diagnosis_whatever_else_was_late(cell: Cell) -> None:
-    check = replace(_checked(_finding(Lag(), 0, 0.003), _finding(Lag(), 1, 0.003)), mistake=None)
-    assert check_diagnoses(check, cell, model_of(cell)) == ()
-
-
 def test_a_direction_of_gravity_is_written_as_finely_as_it_is_known() -> None:
     """A hundredth of a degree is 0.0017 m/s²."""
     turned = vector_text(np.array([-0.0001, 9.81 * np.sin(np.radians(0.01)), -9.81]))
@@ -78,7 +71,7 @@ def test_a_direction_of_gravity_is_written_as_finely_as_it_is_known() -> None:
 
 
 def test_the_zero_of_a_slide_that_shifts_the_whole_arm_is_hidden_by_symmetry() -> None:
-    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(0, 1))
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(0, 1))
     said = hidden_zeros_text(check, ("X", "Y", "Z", "A"), gantry_truth().model.robot)
     why = "another one turns or shifts the whole arm, and no torque depends on that"
     assert said == f"Zeros that are not seen here: of X, Y: {why}."

@@ -32,7 +32,7 @@ from daq.workflow.validate import cross_validate
 from daq.writeback.gates.fit import uncorrected_description
 from ident.data.run import Run
 from ident.discovery.effect_verdict import Judgement
-from ident.discovery.geometry_check import GeometryCheck
+from ident.discovery.geometry_check import AlikeCorrections, GeometryCheck
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import Step, find_effects
 from ident.effects.dictionary import EFFECTS
@@ -324,7 +324,7 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     assert "the gains are without this correction (the squared error on runs left out rises)" in diagnosis.found
     # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be typed in.
     late = passed_finding(LatePosition(), 1, 0.002, 1e-4)
-    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(), alike=(finding, late))
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), alike=(AlikeCorrections((finding, late), ()),))
     (unclear,) = description_diagnoses(replace(fitted, steps=(step,), description=check))
     assert unclear.name == "correction-unclear"
     assert "the zero of J2 off by -4.00 ± 0.10°" in unclear.found
@@ -406,7 +406,7 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
 
 def test_each_hidden_zero_has_its_own_reason(cell: Cell) -> None:
     robot = three_axes_truth().model.robot
-    check = GeometryCheck(gravity=None, mistake=None, hidden_zeros=(0, 1, 2))
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(0, 1, 2))
     text = hidden_zeros_text(check, cell.axis_names, robot)
     assert "of J1: another one turns or shifts the whole arm" in text
     assert "of J3: no joint is behind it" in text

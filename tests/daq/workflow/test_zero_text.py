@@ -49,7 +49,7 @@ def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(checko
     serial = load_cell(checkout / "configs/cells/demo.yaml")
     declared = replace(serial.axes[1], zero_offset_rad=radians(right_deg + too_large_deg))
     serial = replace(serial, axes=(serial.axes[0], declared, *serial.axes[2:]))
-    check = GeometryCheck(gravity=None, mistake=_by_torque(value_rad), hidden_zeros=())
+    check = GeometryCheck(gravity=None, mistakes=(_by_torque(value_rad),), hidden_zeros=())
     (by_torque,) = check_diagnoses(check, serial, model_of(serial))
     name = declared.name
     assert by_torque.found == f"the zero of {name} off by {said}"

@@ -95,6 +95,16 @@ def _runs() -> tuple[Run, ...]:
 
 
 @cache
+def _polar_runs() -> tuple[Run, ...]:
+    """Of two joints, a slide and a wrist."""
+    rng = np.random.default_rng(5)
+    return tuple(
+        record(polar_truth(), f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
+    )
+
+
+@cache
 def _fitted(mistake: Mistake) -> Evidence:
     runs = tuple(_with_mistake(run, mistake) for run in _runs())
     return gathered(_declared(mistake), runs[:4], runs[4:])
@@ -131,10 +141,44 @@ def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mista
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
 def test_the_check_beside_a_fit_names_it_too(mistake: Mistake) -> None:
-    found = _checked(mistake).mistake
-    assert found is not None
+    (found,) = _checked(mistake).mistakes
     assert (found.effect.name, found.axis) == (mistake.name, mistake.axis)
     assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
+
+
+def test_a_wrong_zero_and_a_leaning_base_are_both_named_with_their_sizes() -> None:
+    """Alone, each takes over a part of the other."""
+    both = Mistake("both", 1, (), zero_rad=ZERO_RAD, tilt_rad=TILT_RAD)
+    found = {one.effect.name: one for one in _checked(both).mistakes}
+    assert set(found) == {"zero-offset", "gravity-direction"}
+    zero = found["zero-offset"]
+    assert zero.axis == 1
+    assert abs(zero.coefficients[0] + ZERO_RAD) < 3.0 * zero.deviations[0]
+    turn = found["gravity-direction"]
+    assert np.all(np.abs(turn.coefficients - (-TILT_RAD, 0.0)) < 3.0 * turn.deviations)
+
+
+@pytest.mark.parametrize(("j2_deg", "slide_m"), [(2.0, 0.006), (2.0, -0.006), (-1.0, 0.006)])
+def test_two_wrong_zeros_are_both_named_with_their_sizes(j2_deg: float, slide_m: float) -> None:
+    """Whichever was found first had a value that no correction of the file would have confirmed."""
+    offset = np.array([0.0, np.radians(j2_deg), slide_m, 0.0])
+    runs = tuple(replace(run, position_rad=run.position_rad + offset) for run in _polar_runs())
+    check = check_geometry(gathered(polar_truth(), runs), np.random.default_rng(0), GATES)
+    found = {one.axis: one for one in check.mistakes}
+    assert set(found) == {1, 2}
+    for axis, one in found.items():
+        assert one.effect.name == "zero-offset"
+        assert abs(one.coefficients[0] + offset[axis]) < 3.0 * one.deviations[0]
+
+
+def test_a_wrong_zero_and_late_currents_are_both_named() -> None:
+    delays = Delays((), currents_ms=(3.0, 3.0, 3.0))
+    runs = tuple(_delayed(_with_mistake(run, MISTAKES[0]), delays) for run in _runs()[:4])
+    check = check_geometry(gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES)
+    found = {(one.effect.name, one.axis): one for one in check.mistakes}
+    assert set(found) == {("zero-offset", 1), ("time-skew", 0)}
+    assert abs(found["zero-offset", 1].coefficients[0] + ZERO_RAD) < 3.0 * found["zero-offset", 1].deviations[0]
+    assert abs(found["time-skew", 0].coefficients[0] - 0.003) < 3.0 * found["time-skew", 0].deviations[0]
 
 
 @dataclass(frozen=True)
@@ -206,8 +250,7 @@ def test_undeclared_friction_is_no_late_current() -> None:
 def test_the_check_gives_a_large_zero_its_size(zero_deg: float) -> None:
     """The column of a zero is for small ones: by it alone, 30° are 35 ± 1°."""
     mistake = Mistake("zero-offset", 1, (-np.radians(zero_deg),), zero_rad=np.radians(zero_deg))
-    found = _checked(mistake).mistake
-    assert found is not None
+    (found,) = _checked(mistake).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
     assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
 
@@ -215,7 +258,7 @@ def test_the_check_gives_a_large_zero_its_size(zero_deg: float) -> None:
 def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() -> None:
     assert _searched(CLEAN)[-1].after.effects == ()
     check = _checked(CLEAN)
-    assert check.mistake is None
+    assert check.mistakes == ()
     assert check.hidden_zeros == (0, 2)  # about the vertical, and behind the last joint
     assert check.gravity is not None
     assert check.gravity.turn_rad < 4.0 * check.gravity.turn_std_rad < np.radians(0.5)
@@ -239,19 +282,13 @@ def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
 
 def test_a_slide_between_two_joints_shows_millimetres_of_its_zero() -> None:
     """What is mounted behind the wrist is weighed, so the slide's zero is a lever that the first joints feel."""
-    truth = polar_truth()
-    rng = np.random.default_rng(5)
     moved = np.array([0.0, 0.0, 0.006, 0.0])
-    recorded = [
-        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
-        for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
-    ]
-    runs = tuple(replace(run, position_rad=run.position_rad + moved) for run in recorded)
-    found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
+    runs = tuple(replace(run, position_rad=run.position_rad + moved) for run in _polar_runs())
+    found = check_geometry(gathered(polar_truth(), runs), np.random.default_rng(0), GATES)
     assert found.hidden_zeros == (0, 3)
-    assert found.mistake is not None
-    assert (found.mistake.effect.name, found.mistake.axis) == ("zero-offset", 2)
-    assert abs(found.mistake.coefficients[0] + 0.006) < 3.0 * found.mistake.deviations[0] < 0.0012
+    (slide,) = found.mistakes
+    assert (slide.effect.name, slide.axis) == ("zero-offset", 2)
+    assert abs(slide.coefficients[0] + 0.006) < 3.0 * slide.deviations[0] < 0.0012
 
 
 def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> None:
@@ -294,13 +331,14 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
         )
     fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)  # the gain of J1 is not seen
     check = check_geometry(gather(fixed, runs), np.random.default_rng(0), GATES)
-    assert check.mistake is not None
-    named = {(one.effect.name, one.axis) for one in check.alike}
+    assert len(check.mistakes) == 1
+    (alike,) = check.alike
+    named = {(one.effect.name, one.axis) for one in alike.findings}
     assert named == {("gravity-direction", 0), ("zero-offset", 1)}
-    for one in check.alike:
+    for one in alike.findings:
         assert np.degrees(np.linalg.norm(one.coefficients)) == pytest.approx(2.0, abs=0.5)
         assert np.degrees(np.max(one.deviations)) > 0.01  # a lost direction would have none
-    assert check.axes_to_move == (0,)
+    assert alike.axes_to_move == (0,)
 
 
 def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
@@ -312,7 +350,7 @@ def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
         current[:, 1] += 6.0 * run.position_rad[:, 1] / truth.gains[1]
         runs.append(replace(run, current_a=current))
     found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES)
-    assert found.mistake is None
+    assert found.mistakes == ()
 
 
 def test_check_geometry_names_a_small_zero_beside_a_large_spring_of_another_axis() -> None:
@@ -324,8 +362,7 @@ def test_check_geometry_names_a_small_zero_beside_a_large_spring_of_another_axis
         current = run.current_a.copy()
         current[:, 2] += 2.0 * run.position_rad[:, 2] / truth.gains[2]
         runs.append(replace(_with_mistake(run, mistake), current_a=current))
-    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES).mistake
-    assert found is not None
+    (found,) = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
     assert np.degrees(found.coefficients[0]) == pytest.approx(-1.0, abs=0.3)
 
