@@ -114,6 +114,8 @@ class CheckedGeometry(Report):
     hidden_zeros: list[str]
     #: Why each of them is hidden: by a symmetry of the arm, as the last link's, or by these moves.
     hidden_zero_causes: dict[str, ZeroHiddenBy]
+    #: Two axes each, whose zeros are seen one by one, and not where both are off.
+    hidden_zero_pairs: list[tuple[str, str]]
 
 
 class FitReport(CalibrationBody, Report):
@@ -425,7 +427,10 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Ro
         turn_std_deg = np.degrees(check.gravity.turn_std_rad)
         gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
     causes = {axes[axis]: zero_hidden_by(robot, axis) for axis in check.hidden_zeros}
-    return CheckedGeometry(gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes)
+    pairs = [(axes[first], axes[second]) for first, second in check.hidden_pairs]
+    return CheckedGeometry(
+        gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes, hidden_zero_pairs=pairs
+    )
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:

@@ -585,17 +585,25 @@ WHY_HIDDEN = {
 
 
 def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> str:
-    """Which zeros the data do not show, and why; empty where they show all, or were not asked.
+    """Which zeros the data do not show, alone or two together, and why; empty where they show all, or were not asked.
 
     Args:
         check: beside the fit.
         axes: their names.
         robot: as declared.
     """
-    if check is None or not check.hidden_zeros:
+    if check is None:
         return ""
+    said: list[str] = []
     hidden: dict[ZeroHiddenBy, list[str]] = {}
     for axis in check.hidden_zeros:
         hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
     parts = [f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}" for cause in ZeroHiddenBy if cause in hidden]
-    return f"Zeros that are not seen here: {'; '.join(parts)}."
+    if parts:
+        said.append(f"Zeros that are not seen here: {'; '.join(parts)}.")
+    if check.hidden_pairs:
+        pairs = ", ".join(f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs)
+        said.append(
+            f"Zeros of two joints that are off together, one against the other, and are not seen here: {pairs}."
+        )
+    return " ".join(said)

@@ -423,7 +423,12 @@ def _with_description_after_search(closed: Fit) -> Fit:
     if beside is None:
         return replace(closed, description=replace(description, mistakes=()))
     # Gravity and hidden zeros stay those of the fit; mistakes and their company are those of the final model.
-    kept = replace(beside, gravity=description.gravity, hidden_zeros=description.hidden_zeros)
+    kept = replace(
+        beside,
+        gravity=description.gravity,
+        hidden_zeros=description.hidden_zeros,
+        hidden_pairs=description.hidden_pairs,
+    )
     return replace(closed, description=kept)
 
 

@@ -8,6 +8,8 @@ left is fitted together with everything else, and must pass by the σ of that fi
 
 Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of the other. So the
 test is repeated beside what it has found until it finds nothing more, and all numbers are those of one fit together.
+Two that are wrong by opposite amounts turn only the link between them, and neither passes alone
+(`ident.discovery.pairs_of_zeros`).
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, wit
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
+from ident.discovery.pairs_of_zeros import PairOfZeros, pairs_that_pass, try_pairs
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
@@ -89,6 +92,7 @@ class GeometryCheck:
     mistakes: tuple[Finding, ...]
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
     alike: tuple[AlikeCorrections, ...] = ()  #: of each mistake that does not stand alone
+    hidden_pairs: tuple[tuple[int, int], ...] = ()  #: axes whose zeros are seen one by one, and not both at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +104,7 @@ class _Round:
     findings: tuple[Finding, ...]  #: of all corrections, the best first
     mistakes: tuple[Finding, ...]  #: what it has found
     corrected: Evidence | None  #: fitted with these; None without any
+    pairs: tuple[PairOfZeros, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +123,11 @@ class _Suspect:
     torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
     values: FloatArray  #: their coefficients, shape (p,)
     held_out_fall: float  #: fall of the whitened ‖e‖² on held-out moves
+
+    @property
+    def is_pair(self) -> bool:
+        """Whether it is two zeros that hide each other."""
+        return len(self.effects) > 1 and not self.is_of_currents
 
     @property
     def is_of_currents(self) -> bool:
@@ -183,10 +193,12 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         except TooFewMoves:  # of the corrected description, other moves may be valid
             break
     mistakes = _in_one_fit(rounds)
+    robot = evidence.model.robot
     return GeometryCheck(
         gravity=_gravity(evidence, first.problem),
         mistakes=mistakes,
-        hidden_zeros=_hidden_zeros(first.findings, evidence.model.robot),
+        hidden_zeros=_hidden_zeros(first.findings, robot),
+        hidden_pairs=_hidden_pairs(first.pairs, robot),
         alike=_all_alike(evidence, rounds, mistakes, rng, gates),
     )
 
@@ -206,18 +218,24 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
     of_geometry = _tested(problem, GEOMETRY)
     screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
     findings = rank_families(problem, screened, rng, gates)
-    if not any(found.passed for found in findings):
-        return _Round(evidence, problem, findings, (), None)
+    hidden = _hidden_zeros(findings, problem.model.robot)
+    pairs = try_pairs(problem, [family for family in of_geometry if family.axis not in hidden])
+    wrong_pairs = pairs_that_pass(problem, pairs, rng, gates)
+    if not any(found.passed for found in findings) and not wrong_pairs:
+        return _Round(evidence, problem, findings, (), None, pairs)
     rates_nm_s = torque_rates(evidence)
     of_currents = try_delays(problem, rates_nm_s)
     tested = (*of_geometry, *of_currents)
     findings = rank_families(problem, tested, rng, gates)
     suspects = _suspects(problem, findings, of_currents, rates_nm_s)
-    rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
+    of_pairs = tuple(_suspect_of(problem, pair) for pair in wrong_pairs)
+    rivals = _rivals(evidence, problem, tested, (*suspects, *of_pairs), rng, gates)
     settled = _first_that_stands(evidence, problem, suspects, rivals)
     if settled is None:
-        return _Round(evidence, problem, findings, (), None)
-    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected)
+        settled = _first_that_stands(evidence, problem, of_pairs, rivals)
+    if settled is None:
+        return _Round(evidence, problem, findings, (), None, pairs)
+    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected, pairs)
 
 
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
@@ -250,9 +268,8 @@ def _all_alike(
         if not isinstance(mistake.effect, GeometryEffect):
             continue
         others = tuple(placed_of(one) for one in mistakes if one is not mistake)
-        if not others:
-            beside = rounds[0]
-        else:
+        beside = _round_beside(rounds, evidence, others)
+        if beside is None:
             try:
                 beside = _ranked_beside(evidence, others, rng, gates)
             except UNFITTED:
@@ -262,6 +279,12 @@ def _all_alike(
             axes = axes_to_move([placed_of(one) for one in alike], evidence.model.robot, evidence.fit_runs)
             found.append(AlikeCorrections(alike, axes))
     return tuple(found)
+
+
+def _round_beside(rounds: Sequence[_Round], evidence: Evidence, others: Sequence[PlacedEffect]) -> _Round | None:
+    """The round that was made beside some mistakes and nothing else; None where there was none."""
+    effects = {*evidence.effects, *others}
+    return next((one for one in rounds if set(one.evidence.effects) == effects), None)
 
 
 def _ranked_beside(
@@ -323,6 +346,10 @@ def _suspects(
     return tuple(sorted(suspects, key=lambda one: -one.held_out_fall))
 
 
+def _suspect_of(problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
+    return _Suspect(pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum()))
+
+
 def _rivals(
     evidence: Evidence,
     problem: SearchProblem,
@@ -355,7 +382,7 @@ def _first_that_stands(
     """The best suspect that stands beside all rivals, and in the joint fit; None where none does."""
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
-        if not any(found.passed for found in own):
+        if not suspect.is_pair and not any(found.passed for found in own):
             continue
         best = suspects[0]
         if suspect is not best and not suspect.explains_beside(problem, best.torque_nm):
@@ -440,7 +467,8 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
         shown.append(settled)
-    return _Settled(tuple(shown), corrected) if shown else None
+    is_half = suspect.is_pair and len(shown) < len(own)  # the other zero alone has not passed
+    return _Settled(tuple(shown), corrected) if shown and not is_half else None
 
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
@@ -479,12 +507,23 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
 def _hidden_zeros(findings: Sequence[Finding], robot: Robot) -> tuple[int, ...]:
     """Axes whose zero could be wrong by 2°, or 6 mm, without being named."""
     std_of = {found.axis: float(found.deviations[0]) for found in findings if isinstance(found.effect, ZeroOffset)}
-    hidden: list[int] = []
-    for axis, joint in enumerate(robot.axes):
-        largest = SEEN_ZERO_M if joint.kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
-        if is_placeable(ZeroOffset(), axis, robot) and std_of.get(axis, np.inf) > largest:
-            hidden.append(axis)
+    placeable = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
+    return tuple(axis for axis in placeable if std_of.get(axis, np.inf) > _seen_std(robot, axis))
+
+
+def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int, int], ...]:
+    """Axes whose zeros could be wrong by opposite amounts without being named, although each alone would be."""
+    hidden: list[tuple[int, int]] = []
+    for pair in pairs:
+        largest = np.array([_seen_std(robot, axis) for axis in pair.axes])
+        if np.any(pair.deviations > largest):
+            hidden.append(pair.axes)
     return tuple(hidden)
+
+
+def _seen_std(robot: Robot, axis: int) -> float:
+    """Largest σ of a zero that is seen [rad or m]."""
+    return SEEN_ZERO_M if robot.axes[axis].kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
 
 
 def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tuple[FamilyTrials, ...]:
