@@ -333,10 +333,18 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | 
         if type(placed.effect) in DIAGNOSED_AS:
             values, deviations = coefficients_of(evidence.estimate, placed)
             diagnosis = _correction_diagnosis(placed, values, deviations, cell, given.model)
-            if check is not None:
+            if check is not None and not _is_settled(placed, check, evidence):
                 diagnosis = _beside_alike(diagnosis, placed, check, cell, given.model)
             found.append(diagnosis)
     return tuple(found)
+
+
+def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) -> bool:
+    """Whether a correction that the fit did not tell apart from others stands beside one of them in a model."""
+    for alike in check.alike:
+        if alike.contain(placed):
+            return all(placed_of(found) in evidence.effects for found in alike.findings)
+    return False
 
 
 def open_correction_diagnoses(
@@ -603,7 +611,5 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: R
         said.append(f"Zeros that are not seen here: {'; '.join(parts)}.")
     if check.hidden_pairs:
         pairs = ", ".join(f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs)
-        said.append(
-            f"Zeros of two joints that are off together, one against the other, and are not seen here: {pairs}."
-        )
+        said.append(f"Not seen here where both zeros are off, one against the other: {pairs}.")
     return " ".join(said)
