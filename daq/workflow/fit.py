@@ -508,7 +508,9 @@ def close_loop(
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
-    steps = find_effects(evidence, rng, progress=progress, axes=places)
+    check = start.description
+    named = None if check is None else check.certain_mistakes
+    steps = find_effects(evidence, rng, progress=progress, axes=places, mistakes=named)
     if undecided is not Undecided.ALL_JOIN:
         join = undecided is Undecided.JOIN
         steps = accept_on_holdout(evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places)

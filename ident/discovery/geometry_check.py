@@ -94,6 +94,11 @@ class GeometryCheck:
     alike: tuple[AlikeCorrections, ...] = ()  #: of each mistake that does not stand alone
     hidden_pairs: tuple[tuple[int, int], ...] = ()  #: axes whose zeros are seen one by one, and not both at once
 
+    @property
+    def certain_mistakes(self) -> tuple[Finding, ...]:
+        """Mistakes that the data tell apart from every other correction."""
+        return tuple(one for one in self.mistakes if not any(alike.contain(placed_of(one)) for alike in self.alike))
+
 
 @dataclass(frozen=True, slots=True)
 class _Round:
@@ -161,6 +166,16 @@ class _Rivals:
                 others.append(found)
         return others
 
+    def has_better_fast(self, delay: Finding) -> bool:
+        """Whether a fast effect of the axis of a delay passes, and explains more than it does."""
+        if not isinstance(delay.effect, CLOCK):
+            return False
+        for found in self.findings:
+            is_fast = placed_of(found) in self.at_full_rate
+            if is_fast and found.passed and _is_of_axis(found, delay) and found.held_out_fall > delay.held_out_fall:
+                return True
+        return False
+
     def torque_nm(self, problem: SearchProblem, found: Finding) -> FloatArray:
         """Columns of a finding at the joints, shape (m, p, r)."""
         placed = PlacedEffect(found.effect, found.axis)
@@ -215,8 +230,8 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
         TooFewMoves: there are too few moves to leave some out.
     """
     problem = _problem_at_rows(evidence)
-    of_geometry = _tested(problem, GEOMETRY)
-    screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
+    of_geometry = _not_late_yet(_tested(problem, GEOMETRY), evidence)
+    screened = (*of_geometry, *_not_late_yet(try_delays(problem, rough_torque_rates(evidence)), evidence))
     findings = rank_families(problem, screened, rng, gates)
     hidden = _hidden_zeros(findings, problem.model.robot)
     pairs = try_pairs(problem, [family for family in of_geometry if family.axis not in hidden])
@@ -224,7 +239,7 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
     if not any(found.passed for found in findings) and not wrong_pairs:
         return _Round(evidence, problem, findings, (), None, pairs)
     rates_nm_s = torque_rates(evidence)
-    of_currents = try_delays(problem, rates_nm_s)
+    of_currents = _not_late_yet(try_delays(problem, rates_nm_s), evidence)
     tested = (*of_geometry, *of_currents)
     findings = rank_families(problem, tested, rng, gates)
     suspects = _suspects(problem, findings, of_currents, rates_nm_s)
@@ -236,6 +251,19 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
     if settled is None:
         return _Round(evidence, problem, findings, (), None, pairs)
     return _Round(evidence, problem, findings, settled.mistakes, settled.corrected, pairs)
+
+
+def _not_late_yet(tested: Sequence[FamilyTrials], evidence: Evidence) -> tuple[FamilyTrials, ...]:
+    """Trials without delays of what the model has a delay of: a second one would only mend the form of the first."""
+    late = {placed.axis for placed in evidence.effects if isinstance(placed.effect, (Lag, LatePosition))}
+    has_skew = any(isinstance(placed.effect, TimeSkew) for placed in evidence.effects)
+    left: list[FamilyTrials] = []
+    for family in tested:
+        effect, _ = family.members[0]
+        is_second = has_skew if isinstance(effect, TimeSkew) else isinstance(effect, CLOCK) and family.axis in late
+        if not is_second:
+            left.append(family)
+    return tuple(left)
 
 
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
@@ -360,13 +388,13 @@ def _rivals(
 ) -> _Rivals:
     """Test everything that the suspects compete with, and they themselves, each beside all others.
 
-    A late current also competes with what is fast on its axis: presliding, a gear with a gap or a spring in it.
+    A late current or position also competes with what is fast on its axis: presliding, a gear with a gap or a spring in
+    it.
     """
     families = (*tested, *_tested(problem, _slow(EFFECTS)))
     late: set[int] = set()
     for suspect in suspects:
-        if suspect.is_of_currents:
-            late |= {placed.axis for placed in suspect.effects if placed.effect.has_axis}
+        late |= {one.axis for one in suspect.effects if isinstance(one.effect, CLOCK) and one.effect.has_axis}
     at_full_rate = _columns_at_full_rate(evidence, sorted(late)) if late else {}
     of_fast = problem.trials(at_full_rate.values())
     fast: list[FamilyTrials] = []
@@ -399,7 +427,8 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     """Whether a suspect explains more than every rival, or most of it beside the best.
 
     A late current must do so beside the effects of its own axis, too. Delays of currents do not compete with each
-    other: they were fitted together.
+    other: they were fitted together. A spring or a gap in a gear explains a part of what a delay does, and more: where
+    one passes and explains more than a delay of its axis, the delay is not named before that effect is in the model.
 
     Args:
         problem: around the fit.
@@ -411,6 +440,8 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     best = others[0]
     is_best = suspect.held_out_fall >= best.held_out_fall
     if not is_best and not suspect.explains_beside(problem, rivals.torque_nm(problem, best)):
+        return False
+    if any(rivals.has_better_fast(found) for found in own):
         return False
     if not suspect.is_of_currents:
         return True
@@ -460,7 +491,7 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
             covariance = np.diag(found.deviations**2)
         if impossible(settled.effect.coefficients, settled.coefficients, settled.deviations):
             continue
-        if suspect.is_of_currents and abs(float(settled.coefficients[0])) < LEAST_DELAY_S:
+        if suspect.is_of_currents and _is_unlikely_delay(settled):
             continue
         if in_noise(settled.coefficients, covariance, SHOWN):
             continue
@@ -469,6 +500,19 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
         shown.append(settled)
     is_half = suspect.is_pair and len(shown) < len(own)  # the other zero alone has not passed
     return _Settled(tuple(shown), corrected) if shown and not is_half else None
+
+
+def _is_unlikely_delay(found: Finding) -> bool:
+    """Whether the delay of currents is too short to be named, or is one that no drive has and that explains little.
+
+    A filter of a drive makes its current late. One that is early is a mistake of stamps, which is large; less is what
+    another effect leaves, or a loop that answers to the noise of its encoder.
+    """
+    delay_s = float(found.coefficients[0])
+    if abs(delay_s) < LEAST_DELAY_S:
+        return True
+    is_early_alone = delay_s < 0.0 and isinstance(found.effect, Lag)
+    return is_early_alone and found.explained < Gates().smallest_share
 
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
