@@ -3,8 +3,9 @@
 The first blocks are bare, then one is loaded, and one loaded but held out: with these, gains and their σ are known, and
 one change of the payload is enough. `block_order` says how many are bare, and which kind comes next.
 
-The moves of the first three blocks are for all gains. Those of every later block are for the gain that is farthest from
-its target by then, inside the room and the speed of the first three, which the operator has looked at.
+The moves are for all gains until these are known. Those of every later block are for the gain that is farthest from its
+target by then. From the fourth block on, moves stay inside the room and the speed of the first three, which the
+operator has looked at.
 """
 
 from __future__ import annotations
@@ -181,7 +182,8 @@ class UntilPrecise:
         if number or not context.cell.friction_by_payload or not predicted_percent:
             return state.bare_first
         worst = max(predicted_percent) / self.settings.target_percent
-        return bare_blocks_first(worst**2)
+        blocks_in_time = math.floor(60.0 * self.settings.time_limit_min / self.settings.block_s)
+        return bare_blocks_first(worst**2, blocks_in_time)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
