@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from html import escape
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from daq.errors import (
 from daq.jobs import calibrate as guided_session
 from daq.jobs import job
 from daq.jobs.acceptance import Accept
-from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, mistake_in
+from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, look_at_geometry, mistake_in
 from daq.jobs.block_order import FIRST_BLOCKS
 from daq.jobs.certificate import save_certificate
 from daq.jobs.context import Tools
@@ -55,6 +56,7 @@ from daq.workflow.bus_lock import bus_lock
 from daq.workflow.plan import Plan, load_plan, plan
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
+from ident.errors import Diagnosis, GeometryTurned
 from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
@@ -804,12 +806,85 @@ def test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out(
     def put(payload: str | None) -> None:
         rig.cell_file.write_bytes(before + b"\n# looked at\n")
 
-    with pytest.raises(ConfigurationInconsistent, match="put the old content back"):
+    with pytest.raises(ConfigurationInconsistent, match="put the old content back") as caught:
         run_session(rig, given_answers(rig, put=put))
+    assert "residual" not in str(caught.value)  # no block with the payload yet
     assert [run.name for run in rig.session.state.runs] == ["block-1-bare"]
     rig.cell_file.write_bytes(before)
     assert run_session(rig).outcome is Outcome.APPLIED
     assert rig.session.state.attempt == 2
+
+
+def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    before = rig.cell_file.read_bytes()
+    mounted = count(1)
+
+    def put(payload: str | None) -> None:
+        if next(mounted) == 2:
+            rig.cell_file.write_bytes(before + b"\n# looked at\n")
+
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        run_session(rig, given_answers(rig, put=put))
+    folder = rig.session.folder
+    command = (
+        f"`drivegain residual {folder}/block-1-bare.mcap {folder}/block-2-loaded.mcap --cell {rig.cell_file} "
+        f"--out {folder}/corrected.yaml`"
+    )
+    assert f"The recorded blocks are not lost: {command} fits them with the new content" in str(caught.value)
+    rig.tools = replace(rig.tools, record=None)  # nothing is recorded before the person has read it
+    with pytest.raises(TypeError):
+        run_session(rig)
+    (event,) = [one for one in rig.events if one["event"] == "an unfinished session is not taken up"]
+    assert f"Its blocks are not lost: {command}" in event["reason"]
+
+
+TURNED = Diagnosis("gravity-turned", (), (), "gravity along [0, 1, 0]", "gravity along [0, 0, -1]", "correct it")
+
+
+def test_a_wrong_geometry_ends_the_session_before_a_payload_is_blamed(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    judged: list[list[str]] = []
+
+    def geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
+        judged.append([log.stem for log in logs])
+        return TURNED
+
+    rig.tools = replace(rig.tools, look=Scale(rig, 0.0, 0.1), geometry=geometry)
+    with pytest.raises(GeometryTurned, match="the mounting: found gravity along") as caught:
+        run_session(rig)
+    assert judged == [["block-1-bare", "block-2-loaded"]]
+    assert not [event for event in rig.events if event["event"] == "mistake in a block"]
+    assert [run.name for run in rig.session.state.runs] == ["block-1-bare", "block-2-loaded"]
+    kept, hint = caught.value.__notes__
+    assert kept == "kept: block-1-bare, block-2-loaded"
+    assert hint.startswith("hint: correct the cell file; `drivegain residual")
+    assert hint.endswith("the same command begins a new session")
+
+
+def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(tmp_path: Path, made_session: MadeSession) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    turned = replace(made_session.fitted, diagnoses=(TURNED,))
+    rig.tools = replace(rig.tools, fit=lambda logs, *, holdout: turned)
+    with pytest.raises(GeometryTurned, match="the mounting: found gravity along"):
+        run_session(rig)
+    assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
+    assert rig.session.state.outcome is Outcome.STOPPED
+
+
+def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(whole_session: tuple[Rig, MadeSession]) -> None:
+    rig, made = whole_session
+    logs = [made.logs["block-1-bare"], made.logs["block-2-loaded"]]
+    assert look_at_geometry(rig.cell, logs) is None
+    x, y, z = rig.cell.gravity_m_s2
+    on_the_wall = replace(rig.cell, gravity_m_s2=(z, y, x))
+    found = look_at_geometry(on_the_wall, logs)
+    assert found is not None
+    assert found.name == "gravity-turned"
 
 
 def test_a_log_that_is_damaged_before_the_end_is_recorded_again_in_its_place(
