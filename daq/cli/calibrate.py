@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daq.cli.failure import ErrorParts
 from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
 from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
 from daq.environment import login
@@ -217,11 +218,16 @@ def _check_yes_move(cell: Cell, given: bool) -> None:
         )
 
 
-def _show_check(lines: Sequence[CheckLine]) -> None:
+def show_check(lines: Sequence[CheckLine]) -> None:
     """Print the table of what a session needs; end with an exit code where something is missing."""
     for line in lines:
-        mark = "✓" if line.passed else "✗"
-        typer.echo(printable(f"{mark} {line.name}: {line.text}"))
+        if line.error is None:
+            typer.echo(printable(f"✓ {line.name}: {line.text}"))
+            continue
+        parts = ErrorParts.of(line.error, "calibrate")
+        typer.echo(f"✗ {line.name}")
+        for label, text, _ in parts.lines():
+            typer.echo(printable(f"    {label}: {text}"))
     if not all(line.passed for line in lines):
         raise typer.Exit(ExitCode.CONFIGURATION)
 
@@ -321,7 +327,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
             tools = _tools(options.cell, declared, looks)
             if options.check:
                 context = context_of(options.cell, declared, settings, person, tools, journal)
-                _show_check(check_readiness(context, options.payload, options.block))
+                show_check(check_readiness(context, options.payload, options.block))
                 return
             if not options.enable_motion:
                 raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")

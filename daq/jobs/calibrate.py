@@ -27,7 +27,7 @@ from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
-from ident.errors import GeometryTurned
+from ident.errors import ChannelsExchanged, GeometryTurned
 
 RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
 
@@ -74,6 +74,9 @@ def _name_next_step(cell_file: Path, folder: Path, error: BaseException) -> None
     is_taken = any(note.startswith("kept: ") for note in all_notes(error))  # by what could not be recorded
     if not is_taken:
         error.add_note(f"kept: {blocks or 'no block yet'}")
+    if isinstance(error, ChannelsExchanged):
+        error.add_note("hint: the same command then begins a new session")
+        return
     if isinstance(error, GeometryTurned):
         error.add_note(f"hint: {_after_correction(cell_file, found)}")
         return
@@ -143,8 +146,13 @@ class CheckLine:
     """One line of the table before a session."""
 
     name: str  #: what was checked
-    passed: bool
-    text: str  #: what was found; what to do where it did not pass
+    text: str  #: what was found; empty where an error says it
+    error: DaqError | DriverError | None = None  #: why it did not pass
+
+    @property
+    def passed(self) -> bool:
+        """Whether a session can begin, as far as this line goes."""
+        return self.error is None
 
 
 def check_readiness(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
@@ -160,9 +168,9 @@ def check_readiness(context: SessionContext, payload: str | None, block_s: float
 def _checked(name: str, ask: Callable[[], str]) -> CheckLine:
     """Ask, and turn an error into a line."""
     try:
-        return CheckLine(name, True, ask())
+        return CheckLine(name, ask())
     except (DaqError, DriverError) as error:
-        return CheckLine(name, False, str(error))
+        return CheckLine(name, "", error)
 
 
 def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:

@@ -45,7 +45,7 @@ from daq.workflow.accepted_room import AcceptedRoom, accepted_room
 from daq.workflow.experiment import Experiment, experiment_of
 from daq.workflow.outlook import Outlook, help_with, outlook_of
 from daq.workflow.plan import Plan, load_plan, save_plan, slowed
-from ident.errors import Diagnosis, GeometryTurned, IdentificationError
+from ident.errors import ChannelsExchanged, Diagnosis, GeometryTurned, IdentificationError
 from ident.estimators.estimate import Estimate
 from ident.estimators.turned_geometry import GEOMETRY
 from ident.planning.target import time_to_target
@@ -194,7 +194,7 @@ class UntilPrecise:
         The session is complete when all gains are precise, or its time is up.
 
         Raises:
-            GeometryTurned: the blocks show another geometry than described; they are kept.
+            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are kept.
             JobHeld: a block has shown the same mistake too often.
         """
         return self._judged(context, self._checked(context, session))
@@ -360,7 +360,7 @@ class UntilPrecise:
         """Estimate the gains of the blocks so far; none where they cannot be identified yet.
 
         Raises:
-            GeometryTurned: no further block helps.
+            ChannelsExchanged, GeometryTurned: no further block helps.
         """
         runs = self.runs(session)
         logs = [log_of(session, run.name) for run in runs if not run.holdout]
@@ -375,7 +375,7 @@ class UntilPrecise:
             # What the model lacks is noise to it: a gain may be precise as soon as that is found.
             closed = context.tools.close_loop(fitted, self.settings.seed, lambda _: None)
             gains = gains_so_far(context, closed.estimate, target_percent)
-        except GeometryTurned:
+        except (ChannelsExchanged, GeometryTurned):
             raise
         except IdentificationError as error:
             context.journal.say(Level.WARNING, "the blocks so far do not give the gains", text=str(error))

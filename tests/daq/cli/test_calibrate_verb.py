@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import io
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+import typer
 
-from daq.cli.calibrate import Looks
+from daq.cli.calibrate import Looks, show_check
+from daq.errors import ExitCode
+from daq.jobs.calibrate import CheckLine
 from daq.jobs.journal import Form
 from daq.jobs.story import Story
 from daq.log.feed import Feed, QuickGain, QuickLook
+from drivers.errors import BusError
 
 LOOK = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)])
 
@@ -50,3 +55,16 @@ def test_what_is_missing_is_printed_once_in_a_block(looks: Looks, capsys: pytest
     for move in (1, 2, 3):
         looks.show(replace(waiting, move=move))
     assert capsys.readouterr().err == "No gains yet: no payload.\n"
+
+
+def test_a_check_that_fails_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    refused = BusError("virtual:127.0.0.1:29536", "Connection refused")
+    refused.__cause__ = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+    with pytest.raises(typer.Exit) as ended:
+        show_check((CheckLine("cell file", "6 axes"), CheckLine("disk, interlock, drives", "", refused)))
+    assert ended.value.exit_code == ExitCode.CONFIGURATION
+    first, failed, *parts = capsys.readouterr().out.splitlines()
+    assert first == "✓ cell file: 6 axes"
+    assert failed == "✗ disk, interlock, drives"
+    assert [line.split(":")[0].strip() for line in parts] == ["error", "found", "expected", "do"]
+    assert "drivegain simulate demo" in parts[-1]

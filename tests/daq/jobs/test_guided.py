@@ -45,7 +45,7 @@ from daq.jobs.block_order import FIRST_BLOCKS
 from daq.jobs.certificate import save_certificate
 from daq.jobs.context import Tools
 from daq.jobs.operator import GivenAnswers
-from daq.jobs.reporting import Conclusion, ending
+from daq.jobs.reporting import Conclusion, ending, to_do
 from daq.jobs.session import Session
 from daq.jobs.stages import TO_DECISION, Certify, Decide, Identify, Record, Stage, WatchDrift
 from daq.ledger.audit import AuditAction
@@ -53,10 +53,11 @@ from daq.report.plan_preview import save_preview
 from daq.simulation import demo
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.bus_lock import bus_lock
+from daq.workflow.fit import Fit
 from daq.workflow.plan import Plan, load_plan, plan
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
-from ident.errors import Diagnosis, GeometryTurned
+from ident.errors import ChannelsExchanged, Diagnosis, GeometryTurned
 from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
@@ -834,11 +835,27 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
         f"--out {folder}/corrected.yaml`"
     )
     assert f"The recorded blocks are not lost: {command} fits them with the new content" in str(caught.value)
-    rig.tools = replace(rig.tools, record=None)  # nothing is recorded before the person has read it
-    with pytest.raises(TypeError):
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    rig.tools = replace(rig.tools, drives=stop)  # before anything moves
+    with pytest.raises(KeyboardInterrupt):
         run_session(rig)
     (event,) = [one for one in rig.events if one["event"] == "an unfinished session is not taken up"]
     assert f"Its blocks are not lost: {command}" in event["reason"]
+
+
+def test_what_the_fit_says_to_check_is_to_do(tmp_path: Path, made_session: MadeSession) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    late = Diagnosis("current-late", (), ("J2",), "a current that is late by 2 ms", "no delay", "declare its delay")
+    made = rig.tools.calibration
+    rig.tools = replace(rig.tools, calibration=lambda fitted, now: replace(made(fitted, now), diagnoses=(late,)))
+    ended = run_session(rig)
+    assert ended.outcome is Outcome.APPLIED
+    assert to_do(ended, rig.cell_file)[-1] == "CHECK J2: declare its delay"
+    unchanged = replace(ended, outcome=Outcome.UNCHANGED)
+    assert to_do(unchanged, rig.cell_file) == ["CHECK J2: declare its delay"]
 
 
 TURNED = Diagnosis("gravity-turned", (), (), "gravity along [0, 1, 0]", "gravity along [0, 0, -1]", "correct it")
@@ -874,6 +891,19 @@ def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(tmp_path: Path, m
         run_session(rig)
     assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
     assert rig.session.state.outcome is Outcome.STOPPED
+
+
+def test_exchanged_currents_ask_for_no_further_block(tmp_path: Path, made_session: MadeSession) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+
+    def refused(logs: Sequence[Path], *, holdout: Sequence[Path]) -> Fit:
+        raise ChannelsExchanged("J1 and J2", found="each other's", expected="their own", remedy="record again")
+
+    rig.tools = replace(rig.tools, fit=refused)
+    with pytest.raises(ChannelsExchanged) as caught:
+        run_session(rig)
+    assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
+    assert caught.value.__notes__[-1] == "hint: the same command then begins a new session"
 
 
 def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(whole_session: tuple[Rig, MadeSession]) -> None:
