@@ -79,7 +79,9 @@ def test_a_log_of_exchanged_node_numbers_is_to_be_recorded_again(checkout: Path,
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     first, second, *others = cell.axes
     exchanged = (replace(first, node_id=second.node_id), replace(second, node_id=first.node_id), *others)
-    with pytest.raises(LogsDiffer, match=r"node id 1 of axis J1; expected 2.*record again with the corrected cell file"):
+    with pytest.raises(
+        LogsDiffer, match=r"node id 1 of axis J1; expected 2.*record again with the corrected cell file"
+    ):
         load_run(log, replace(cell, axes=exchanged))
 
 
