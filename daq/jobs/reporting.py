@@ -239,7 +239,10 @@ def ending(conclusion: Conclusion, cell_file: Path) -> str:
     lines = ["", f"Outcome: {conclusion.outcome.value}"]
     session = conclusion.session
     if session is not None and isinstance(session.state, GuidedState):
-        lines += _guided_lines(session.state)
+        state = session.state
+        if state.acceptance is not None and state.acceptance.accepted:  # said just before
+            state = state.model_copy(update={"acceptance": None})
+        lines += _guided_lines(state)
     lines += _closing(conclusion, cell_file)
     return "\n".join(lines) + "\n"
 

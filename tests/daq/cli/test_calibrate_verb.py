@@ -33,11 +33,10 @@ def test_a_look_is_printed_where_the_errors_go_now(looks: Looks, capsys: pytest.
     """A progress bar replaces the stream while it is shown."""
     looks.show(LOOK)
     looks.show(replace(LOOK, move=4))
+    looks.show(replace(LOOK, move=5, gains=[replace(LOOK.gains[0], std_percent=0.1)]))
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[0] for line in said] == [
-        "Quick estimate after move 3 of 9",
-        "Quick estimate after move 4 of 9",
-    ]
+    assert [line.split(",")[1] for line in said] == [" move 3 of 9", " move 5 of 9"]
+    assert looks.remark == "moves, J1 ± 0.10 % (target 0.5 %)"
 
 
 def test_a_look_that_comes_after_its_block_does_not_disturb_the_operator(
