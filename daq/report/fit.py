@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -38,10 +38,12 @@ from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.effects.effect import PlacedEffect
+from ident.errors import Diagnosis
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
+from ident.estimators.turned_geometry import GEOMETRY
 from ident.model.robot import Robot
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 
@@ -190,7 +192,7 @@ def fit_view(
         *sigma_notes(fitted),
         *geometry_notes(fitted.description, axes, robot_of(fitted.cell)),
         *identifiability_notes(fitted, calibration.payload_mass),
-        *advice(fitted, needed_verdicts(fitted)),
+        *_advice_unless_turned(fitted, calibration),
     )
     yield from map(Sentence, notes)
     if comparison is not None:
@@ -431,6 +433,17 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Ro
     return CheckedGeometry(
         gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes, hidden_zero_pairs=pairs
     )
+
+
+def _advice_unless_turned(fitted: Fit, calibration: Calibration) -> Iterator[str]:
+    """As `advice`; nothing in a geometry that is wrong: no number means anything there."""
+    if not names_turned_geometry(calibration.diagnoses):
+        yield from advice(fitted, needed_verdicts(fitted))
+
+
+def names_turned_geometry(diagnoses: Iterable[Diagnosis]) -> bool:
+    """Whether a fit says that gravity, a zero or the sense of a position is far from what is described."""
+    return any(one.name in GEOMETRY and not one.runs for one in diagnoses)
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
