@@ -235,7 +235,11 @@ class Diagnosis:
     remedy: str
 
     @property
+    def subject(self) -> str:
+        """Runs and axes that it points at, or the fit."""
+        return ", ".join((*self.runs, *self.axes)) or "the fit"
+
+    @property
     def text(self) -> str:
         """The diagnosis in one line."""
-        subject = ", ".join((*self.runs, *self.axes)) or "the fit"
-        return f"{subject}: found {self.found}; expected {self.expected}; {self.remedy} ({self.name})"
+        return f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy} ({self.name})"

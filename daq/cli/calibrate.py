@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daq.cli.failure import ErrorParts
 from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
 from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
 from daq.environment import login
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 YES = "yes"  #: What the operator types to write
 KEEP = "keep"  #: What the operator types where a block shows a mistake and is right all the same
+MOVES = "moves"  #: Unit of the progress of a block
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +96,7 @@ class Person:
         tell("")
         tell(f"── {run.name}: {on_flange(run)} ──", bold=True)
         if self.asks_before_motion:
-            todo = "Take off what is there" if run.payload is None else "Mount it if it is not mounted"
-            ask(f"{todo}, leave the cell, then press Enter")
+            ask("Check the flange, leave the cell, press Enter")
 
     def weigh(self, payload: str) -> float:
         """Ask for the mass from the scale, twice, until both are the same and that of the cell file."""
@@ -116,7 +117,7 @@ class Person:
         if not self.may_move:
             raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
         if self.asks_before_motion:
-            ask(f"The robot moves now. Press Enter to start {run.name}, Ctrl-C to stop here")
+            ask("The robot moves now: Enter starts it, Ctrl-C stops")
         return self.who
 
     def record_again(self, run: PlannedRun, mistake: str) -> bool:
@@ -130,7 +131,7 @@ class Person:
         show_proposal(proposal, output_console())
         if touched:
             tell("! The controller's file was written or rolled back since the session began.")
-        return ask(f"Type {YES} to write these gains to {proposal.edit.subject}, anything else to leave them") == YES
+        return ask(f"Type {YES} to write to {proposal.edit.subject}, else Enter") == YES
 
 
 def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
@@ -217,11 +218,16 @@ def _check_yes_move(cell: Cell, given: bool) -> None:
         )
 
 
-def _show_check(lines: Sequence[CheckLine]) -> None:
+def show_check(lines: Sequence[CheckLine]) -> None:
     """Print the table of what a session needs; end with an exit code where something is missing."""
     for line in lines:
-        mark = "✓" if line.passed else "✗"
-        typer.echo(printable(f"{mark} {line.name}: {line.text}"))
+        if line.error is None:
+            typer.echo(printable(f"✓ {line.name}: {line.text}"))
+            continue
+        parts = ErrorParts.of(line.error, "calibrate")
+        typer.echo(f"✗ {line.name}")
+        for label, text, _ in parts.lines():
+            typer.echo(printable(f"    {label}: {text}"))
     if not all(line.passed for line in lines):
         raise typer.Exit(ExitCode.CONFIGURATION)
 
@@ -234,9 +240,10 @@ class Looks:
     journal: Journal  #: for the terminal
     block: str = ""  #: that is being recorded; empty between two blocks
     last: QuickLook | None = None  #: that was printed
+    remark: str = MOVES  #: beside the progress bar of a block
 
     def show(self, look: QuickLook) -> None:
-        """Publish a look, and print it if it is new; in the thread that receives it.
+        """Publish a look, put its worst gain beside the bar, and print it if it is new; in the thread that receives it.
 
         One that comes after the end of its block is not printed: the operator types then.
         """
@@ -244,6 +251,9 @@ class Looks:
         from daq.jobs.live_gains import tells_something_new
 
         self.feed.look(look)
+        if look.gains:
+            worst = look.gains[0]
+            self.remark = f"{MOVES}, {worst.axis} ± {worst.std_percent:.2f} % (target {worst.target_percent:g} %)"
         is_late = look.block not in ("", self.block)
         if is_late or not tells_something_new(look, self.last):
             return
@@ -270,11 +280,12 @@ def _tools(cell_file: Path, cell: Cell, looks: Looks) -> Tools:
         # A bar of its own: between two blocks the operator types, and a bar would take the line.
         with progress_bar(f"recording {request.out.stem}") as report_progress:
             looks.block = request.out.stem
+            looks.remark = MOVES
             try:
                 return record(
                     request,
                     feed=looks.feed,
-                    progress=lambda done, total: report_progress(done, total, "moves"),
+                    progress=lambda done, total: report_progress(done, total, looks.remark),
                     **further,
                 )
             finally:
@@ -321,7 +332,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
             tools = _tools(options.cell, declared, looks)
             if options.check:
                 context = context_of(options.cell, declared, settings, person, tools, journal)
-                _show_check(check_readiness(context, options.payload, options.block))
+                show_check(check_readiness(context, options.payload, options.block))
                 return
             if not options.enable_motion:
                 raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")

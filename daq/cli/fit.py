@@ -32,7 +32,7 @@ from daq.cli.verb import (
     print_json,
     taking,
 )
-from daq.errors import OutputFailed, UsageError, writing
+from daq.errors import ExitCode, OutputFailed, UsageError, writing
 from daq.files import replace_file
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
@@ -164,9 +164,11 @@ def fit_verb(request: FitRequest) -> None:
             comparison = compare_estimators(found.fitted, report_step)
     if request.json:
         print_json(fit_report(found, calibration, comparison))
+        end_if_turned(calibration)
         return
     print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
     say_after_fit(calibration, [*request.logs, *request.options()], request.out)
+    end_if_turned(calibration)
 
 
 def _fit(request: FitRequest) -> CaseFit:
@@ -312,6 +314,7 @@ def residual_verb(request: ResidualRequest) -> None:
     show(request.out, request.report, request.pictures)
     if not request.json:
         _say_after_search(request, calibration)
+    end_if_turned(calibration)
 
 
 def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
@@ -377,6 +380,14 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")
+
+
+def end_if_turned(calibration: Calibration) -> None:
+    """End with the exit code of a fit that is refused, where it names a geometry in which no number means anything."""
+    from daq.report.fit import names_turned_geometry
+
+    if names_turned_geometry(calibration.diagnoses):
+        raise typer.Exit(ExitCode.DATA_UNFIT)
 
 
 def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:

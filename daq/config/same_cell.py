@@ -23,12 +23,19 @@ _REMEDY = (
 )
 
 
+_RECORD_AGAIN = (
+    "the node numbers were exchanged after this recording, and a log keeps those that it was recorded with: "
+    "record again with the corrected cell file"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Mismatch:
     """What shows that two descriptions are of different cells."""
 
     found: str
     expected: str
+    remedy: str = _REMEDY
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +72,7 @@ def correction_of(
     else:
         found = mismatch(own, given) or _mismatch_of_drives(own, given, serials)
     if found is not None:
-        raise LogsDiffer(log, found=found.found, expected=found.expected, remedy=_REMEDY)
+        raise LogsDiffer(log, found=found.found, expected=found.expected, remedy=found.remedy)
     if own is None:
         return Correction("", (CELL,))
     sections = differing_sections(own, given)
@@ -85,8 +92,16 @@ def mismatch(own: Cell, given: Cell) -> Mismatch | None:
         for label, recorded, wanted in _drive_of(one, other):
             if recorded is not None and wanted is not None and recorded != wanted:
                 found_text = f"{label} {recorded} of axis {one.name}"
-                return Mismatch(found_text, f"{wanted}, as in the given description")
+                remedy = _RECORD_AGAIN if _has_exchanged_nodes(own, given) else _REMEDY
+                return Mismatch(found_text, f"{wanted}, as in the given description", remedy)
     return None
+
+
+def _has_exchanged_nodes(own: Cell, given: Cell) -> bool:
+    """Whether two descriptions have the same node numbers on other axes."""
+    first = [axis.node_id for axis in own.axes]
+    second = [axis.node_id for axis in given.axes]
+    return first != second and set(first) == set(second)
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:

@@ -55,7 +55,7 @@ class Accept:
     def _made(self, context: SessionContext, session: Session) -> Acceptance:
         """Make the run, and judge it."""
         before_motion(context)  # the command may have been started again for this run alone
-        require_same_cell(context)
+        require_same_cell(context, session)
         _require_written(context, session)
         last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"

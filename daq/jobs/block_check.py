@@ -1,7 +1,8 @@
 """Look at a block right after its recording: a mistake that it shows costs one block then, and not the session.
 
 The body on the flange is weighed with the nameplate gains (`ident.weighing`), beside the blocks before. These
-gains may be off by a quarter; a body that was forgotten is off by all of its mass.
+gains may be off by a quarter; a body that was forgotten is off by all of its mass. In a wrong geometry the weighing
+tells nothing, so gravity and the positions are judged before a body is blamed.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from daq.config.cell import Cell, model_of
 from daq.documents.session_state import Block
 from daq.errors import DataError
 from daq.log.conversion import load_run
+from daq.workflow.diagnoses import Recordings, turned_geometry
 from ident.calibration import Calibration, Gain
-from ident.errors import IdentificationError
+from ident.errors import Diagnosis, IdentificationError
 from ident.estimators.estimate import RelativeError
 from ident.weighing import weigh
 
@@ -47,6 +49,7 @@ class Mistake:
 
     blocks: tuple[str, ...]  #: to record again, the last ones of the session
     text: str  #: what was found and what to do, in a sentence or two
+    is_of_body: bool = True  #: whether another body on the flange than declared is blamed
 
 
 def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
@@ -82,6 +85,18 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
     )
 
 
+def look_at_geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
+    """Return what is wrong with gravity, a zero or the sense of a position by these logs, as a fit of them says it.
+
+    None where the description explains them as well as any other, and where they tell nothing.
+    """
+    recordings = Recordings(tuple(logs), lambda log: load_run(log, cell), gains_fixed=False, described=cell)
+    try:
+        return turned_geometry(recordings, (), None)
+    except (DataError, IdentificationError):
+        return None
+
+
 def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
     """Return the earlier blocks that the last one is weighed beside: those with the same body, else the bare ones."""
     *earlier, last = blocks
@@ -99,10 +114,11 @@ def mistake_in(cell: Cell, blocks: Sequence[Block], facts: BlockFacts) -> Mistak
     """
     last = blocks[-1]
     if facts.unreadable:
-        return Mistake((last.name,), f"No fit can use this block: {facts.unreadable}.")
+        text = f"No fit can use this block: {facts.unreadable}."
+        return Mistake((last.name,), text, is_of_body=False)
     limited = _limited(cell, facts)
     if limited:
-        return Mistake((last.name,), limited)
+        return Mistake((last.name,), limited, is_of_body=False)
     bodies = {block.payload: block.mass_kg for block in blocks if block.payload is not None and block.mass_kg}
     if facts.added_kg is None or not bodies:
         return None
@@ -165,16 +181,17 @@ def _beside_bare(
     last = blocks[-1]
     name = payload.upper()
     everything = tuple(block.name for block in blocks)
+    again = "All of these are recorded again, those before the last one without anything on the flange."
     if abs(added_kg) <= least_kg:
         text = (
             f"The flange carried the same in {' and '.join(everything)}: {name} was missing now, or there before. "
-            "Both are recorded again, the first one without anything on the flange."
+            f"{again}"
         )
         return Mistake(everything, text)
     if added_kg < 0.0:
         text = (
-            f"The flange carried about {-added_kg:.2g} kg more without load than with {name}: the two were exchanged. "
-            "Both are recorded again, the first one without anything on the flange."
+            f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more without load than with "
+            f"{name}: the two were exchanged. {again}"
         )
         return Mistake(everything, text)
     lower, upper = SAME_BODY

@@ -49,18 +49,21 @@ def first_blocks(bare: int) -> tuple[BlockRole, ...]:
     return (*(BlockRole.BARE,) * bare, *FIRST_BLOCKS[1:])
 
 
-def bare_blocks_first(variance_ratio: float) -> int:
+def bare_blocks_first(variance_ratio: float, blocks_in_time: int) -> int:
     """Return how many bare blocks to record before the payload is mounted, at least one.
 
     Of n bare and as many loaded blocks, σ² is that of one of each over n. One bare block too many costs its time; with
-    one too few the payload comes off again, which takes longer.
+    one too few the payload comes off again, which takes longer. Of a session too short for the target, half of the
+    blocks of the fit are bare.
 
     Args:
         variance_ratio: predicted σ² of the worst gain over that of its target, with one bare and one loaded block.
+        blocks_in_time: number of blocks until the time limit, the held-out one included.
     """
+    most = min(MOST_BARE_FIRST, max(1, (blocks_in_time - 1) // 2))
     if not math.isfinite(variance_ratio):
-        return MOST_BARE_FIRST
-    return min(max(1, math.ceil(variance_ratio - ROUNDING)), MOST_BARE_FIRST)
+        return most
+    return min(max(1, math.ceil(variance_ratio - ROUNDING)), most)
 
 
 def fixed_role(number: int) -> BlockRole:

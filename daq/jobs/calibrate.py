@@ -16,7 +16,7 @@ from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
 from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
 from daq.jobs.gain_target import target_of
-from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise
+from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise, fit_corrected_command
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.position import goes_on_with
@@ -27,6 +27,7 @@ from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
+from ident.errors import ChannelsExchanged, GeometryTurned
 
 RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
 
@@ -59,12 +60,12 @@ def calibrate(
             session = run_stages(stages_of(settings), context, session)
         except BaseException as error:
             report_failure(context, session.folder, error)
-            _name_next_step(session.folder, error)
+            _name_next_step(cell_file, session.folder, error)
             raise
         return report_success(context, session)
 
 
-def _name_next_step(folder: Path, error: BaseException) -> None:
+def _name_next_step(cell_file: Path, folder: Path, error: BaseException) -> None:
     """Add to an error which blocks the session has, and what the same command does next."""
     found = next((one for one in sessions.sessions(folder.parent) if one.folder == folder), None)
     if found is None or found.finished or not isinstance(found.state, GuidedState):
@@ -73,7 +74,22 @@ def _name_next_step(folder: Path, error: BaseException) -> None:
     is_taken = any(note.startswith("kept: ") for note in all_notes(error))  # by what could not be recorded
     if not is_taken:
         error.add_note(f"kept: {blocks or 'no block yet'}")
+    if isinstance(error, ChannelsExchanged):
+        error.add_note("hint: the same command then begins a new session")
+        return
+    if isinstance(error, GeometryTurned):
+        error.add_note(f"hint: {_after_correction(cell_file, found)}")
+        return
     error.add_note(f"hint: remove the cause, then start the same command: {goes_on_with(found.state)}")
+
+
+def _after_correction(cell_file: Path, session: Session) -> str:
+    """Say what to do with the blocks of a session once its cell file is corrected."""
+    again = "the same command begins a new session"
+    command = fit_corrected_command(cell_file, session)
+    if not command:
+        return f"correct the cell file; {again}"
+    return f"correct the cell file; `{command}` then fits these blocks with it, and {again}"
 
 
 def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
@@ -117,7 +133,9 @@ def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datet
     if not found or found[-1].finished:
         return
     last = found[-1]
-    reason = "the cell file has changed since"
+    command = fit_corrected_command(context.file, last) if isinstance(last.state, GuidedState) else ""
+    refit = f". Its blocks are not lost: `{command}` fits them with the present file" if command else ""
+    reason = f"the cell file has changed since{refit}"
     if now - last.began > timedelta(hours=RESUME_WITHIN_H):
         reason = f"it is older than {RESUME_WITHIN_H:g} h"
     context.journal.say(Level.WARNING, "an unfinished session is not taken up", folder=str(last.folder), reason=reason)
@@ -128,8 +146,13 @@ class CheckLine:
     """One line of the table before a session."""
 
     name: str  #: what was checked
-    passed: bool
-    text: str  #: what was found; what to do where it did not pass
+    text: str  #: what was found; empty where an error says it
+    error: DaqError | DriverError | None = None  #: why it did not pass
+
+    @property
+    def passed(self) -> bool:
+        """Whether a session can begin, as far as this line goes."""
+        return self.error is None
 
 
 def check_readiness(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
@@ -145,9 +168,9 @@ def check_readiness(context: SessionContext, payload: str | None, block_s: float
 def _checked(name: str, ask: Callable[[], str]) -> CheckLine:
     """Ask, and turn an error into a line."""
     try:
-        return CheckLine(name, True, ask())
+        return CheckLine(name, ask())
     except (DaqError, DriverError) as error:
-        return CheckLine(name, False, str(error))
+        return CheckLine(name, "", error)
 
 
 def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:

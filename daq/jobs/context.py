@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from daq.config.cell import Cell, MotionPolicy
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
-from daq.jobs.block_check import BlockFacts, look_at_block
+from daq.jobs.block_check import BlockFacts, look_at_block, look_at_geometry
 from daq.jobs.certificate import renew_certificate
 from daq.jobs.gain_target import GainTarget, NetworkMaker
 from daq.jobs.journal import Journal, Level
@@ -45,6 +45,7 @@ from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
 from ident.discovery.evidence import Evidence
 from ident.discovery.loop import Step
+from ident.errors import Diagnosis
 
 CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
 
@@ -197,6 +198,13 @@ class BlockReader(Protocol):
         """As `daq.jobs.block_check.look_at_block`."""
 
 
+class GeometryJudge(Protocol):
+    """Judges the described geometry by logs."""
+
+    def __call__(self, cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
+        """As `daq.jobs.block_check.look_at_geometry`."""
+
+
 class Validator(Protocol):
     """Predicts logs with a calibration."""
 
@@ -222,6 +230,7 @@ class Tools:
     preview: Callable[[Cell, Plan, Path, Path], None] = save_preview  #: writes a page that shows a plan, from its file
     record: Recorder = record
     look: BlockReader = look_at_block
+    geometry: GeometryJudge = look_at_geometry
     fit: Fitter = fit
     close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of

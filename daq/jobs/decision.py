@@ -56,7 +56,9 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
     differs = any(gain.differs for gain in decision.gains)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
-    context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
+    context.journal.say(
+        Level.NOTICE, "compared with the gains in the controller", words=decision.remark, differs=differs
+    )
     after = sha256(edit.after)
     target = PlannedWrite(
         file=str(edit.name),

@@ -3,13 +3,15 @@
 The first blocks are bare, then one is loaded, and one loaded but held out: with these, gains and their σ are known, and
 one change of the payload is enough. `block_order` says how many are bare, and which kind comes next.
 
-The moves of the first three blocks are for all gains. Those of every later block are for the gain that is farthest from
-its target by then, inside the room and the speed of the first three, which the operator has looked at.
+The moves are for all gains until these are known. Those of every later block are for the gain that is farthest from its
+target by then. From the fourth block on, moves stay inside the room and the speed of the first three, which the
+operator has looked at.
 """
 
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -43,12 +45,14 @@ from daq.workflow.accepted_room import AcceptedRoom, accepted_room
 from daq.workflow.experiment import Experiment, experiment_of
 from daq.workflow.outlook import Outlook, help_with, outlook_of
 from daq.workflow.plan import Plan, load_plan, save_plan, slowed
-from ident.errors import IdentificationError
+from ident.errors import ChannelsExchanged, Diagnosis, GeometryTurned, IdentificationError
 from ident.estimators.estimate import Estimate
+from ident.estimators.turned_geometry import GEOMETRY
 from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
 MAX_REPETITIONS = 3  #: Of one block, before the session is held
+CORRECTED = "corrected.yaml"  #: Calibration of the blocks of a session by a corrected cell file
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +123,7 @@ class UntilPrecise:
         state = guided(session)
         if state.complete:
             return session, None
-        require_same_cell(context)
+        require_same_cell(context, session)
         number = _next_number(state)
         role = self._role_of(context, state, state.gains, number)
         name = name_of(number, role)
@@ -181,7 +185,8 @@ class UntilPrecise:
         if number or not context.cell.friction_by_payload or not predicted_percent:
             return state.bare_first
         worst = max(predicted_percent) / self.settings.target_percent
-        return bare_blocks_first(worst**2)
+        blocks_in_time = math.floor(60.0 * self.settings.time_limit_min / self.settings.block_s)
+        return bare_blocks_first(worst**2, blocks_in_time)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in a block, then judge the gains.
@@ -189,6 +194,7 @@ class UntilPrecise:
         The session is complete when all gains are precise, or its time is up.
 
         Raises:
+            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are kept.
             JobHeld: a block has shown the same mistake too often.
         """
         return self._judged(context, self._checked(context, session))
@@ -209,6 +215,9 @@ class UntilPrecise:
             if facts.added_kg is not None and last.payload is not None and compared_with(in_order)[-1].payload is None:
                 context.journal.say(Level.INFO, "weighed", added_kg=facts.added_kg, std_kg=facts.added_std_kg)
             return session.update(checked_blocks=recorded)
+        if mistake.is_of_body:
+            logs = [log_of(session, block.name) for block in in_order]
+            refuse_geometry(context.tools.geometry(context.cell, logs))
         context.journal.say(Level.WARNING, "mistake in a block", block=last.name, text=mistake.text)
         if not context.operator.record_again(_planned(session, last), mistake.text):
             context.journal.say(Level.NOTICE, "kept as it is", block=last.name)
@@ -348,19 +357,26 @@ class UntilPrecise:
         return plan_moves(context, name, path, self.settings.seed + number, self.settings.block_s)
 
     def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
-        """Estimate the gains of the blocks so far; none where they cannot be identified yet."""
+        """Estimate the gains of the blocks so far; none where they cannot be identified yet.
+
+        Raises:
+            ChannelsExchanged, GeometryTurned: no further block helps.
+        """
         runs = self.runs(session)
         logs = [log_of(session, run.name) for run in runs if not run.holdout]
         unseen = [log_of(session, run.name) for run in runs if run.holdout]
         target_percent = self.settings.target_percent
         try:
             fitted = context.tools.fit(logs, holdout=unseen)
+            refuse_geometry(next((one for one in fitted.diagnoses if one.name in GEOMETRY), None))
             gains = gains_so_far(context, fitted.estimate, target_percent)
             if all(gain.is_precise for gain in gains):
                 return BlockEstimate(gains)
             # What the model lacks is noise to it: a gain may be precise as soon as that is found.
             closed = context.tools.close_loop(fitted, self.settings.seed, lambda _: None)
             gains = gains_so_far(context, closed.estimate, target_percent)
+        except (ChannelsExchanged, GeometryTurned):
+            raise
         except IdentificationError as error:
             context.journal.say(Level.WARNING, "the blocks so far do not give the gains", text=str(error))
             return BlockEstimate(())
@@ -453,7 +469,39 @@ def say_moves(context: SessionContext, run: str, path: Path) -> None:
     context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html")))
 
 
-def require_same_cell(context: SessionContext) -> None:
+def refuse_geometry(found: Diagnosis | None) -> None:
+    """Refuse blocks that show another geometry than described; nothing is refused without a diagnosis.
+
+    Raises:
+        GeometryTurned: with the words of the diagnosis.
+    """
+    if found is None:
+        return
+    subject = ", ".join(found.axes) or "the mounting"
+    raise GeometryTurned(subject, found=found.found, expected=found.expected, remedy=found.remedy)
+
+
+def fit_corrected_command(cell_file: Path, session: Session) -> str:
+    """Return the command that fits the recorded blocks with a corrected cell file.
+
+    Empty as long as no block of the fit carries the payload.
+    """
+    state = guided(session)
+    recorded = {run.name for run in state.runs}
+    blocks = [block for block in state.blocks if block.name in recorded]
+    used = [block for block in blocks if not block.holdout]
+    if all(block.payload is None for block in used):
+        return ""
+    words: list[object] = ["drivegain", "residual"]
+    words += [log_of(session, block.name) for block in used]
+    for block in blocks:
+        if block.holdout:
+            words += ["--holdout", log_of(session, block.name)]
+    words += ["--cell", cell_file, "--out", session.folder / CORRECTED]
+    return shlex.join(map(str, words))
+
+
+def require_same_cell(context: SessionContext, session: Session) -> None:
     """Refuse a cell file that was changed since the session began; its next log would be of another cell.
 
     Raises:
@@ -461,12 +509,14 @@ def require_same_cell(context: SessionContext) -> None:
     """
     found = load_cell(context.file).digest
     if found != context.cell.digest:
+        command = fit_corrected_command(context.file, session)
+        refit = f". The recorded blocks are not lost: `{command}` fits them with the new content" if command else ""
         raise ConfigurationInconsistent(
             str(context.file),
             found=f"another content (digest {found[:12]}) than at the start of this command",
             expected=f"the same cell in all blocks of a session (digest {context.cell.digest[:12]})",
             remedy="nothing moves; put the old content back and start the same command, which goes on, or start it "
-            "with the new content, which begins a new session",
+            f"with the new content, which begins a new session{refit}",
         )
 
 

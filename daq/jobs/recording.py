@@ -31,7 +31,7 @@ from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
-from daq.report.residual import summary
+from daq.report.residual import headline, summary
 from daq.report.residual_page import PAGE
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import release_check
@@ -287,8 +287,9 @@ def fit_session(context: SessionContext, session: Session) -> Session:
     context.tools.save_report(closed, changed, calibration, report)
     context.journal.say(Level.INFO, "certificate", page=str(report / PAGE))
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed, calibration.effects))
+    in_short = headline(closed, changed, calibration.effects)
     for sentence in fit.sentences:
-        context.journal.say(Level.INFO, "found", text=sentence)
+        context.journal.say(Level.INFO, "found", text=sentence, in_short=sentence in in_short)
     return session.update(fitted=fit)
 
 

@@ -34,6 +34,7 @@ AnyReport = TypeVar("AnyReport", JobReport, SessionReport)
 
 SUMMARY_TEXT = "summary.txt"
 SUMMARY_JSON = "summary.json"
+NOTHING_TO_DO = ["nothing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +239,10 @@ def ending(conclusion: Conclusion, cell_file: Path) -> str:
     lines = ["", f"Outcome: {conclusion.outcome.value}"]
     session = conclusion.session
     if session is not None and isinstance(session.state, GuidedState):
-        lines += _guided_lines(session.state)
+        state = session.state
+        if state.acceptance is not None and state.acceptance.accepted:  # said just before
+            state = state.model_copy(update={"acceptance": None})
+        lines += _guided_lines(state)
     lines += _closing(conclusion, cell_file)
     return "\n".join(lines) + "\n"
 
@@ -277,7 +281,26 @@ def undo_command(cell_file: Path, *, in_drives: bool) -> str:
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
-    """List the next steps for the operator, a line each."""
+    """List the next steps for the operator, a line each: those of the outcome, then what the fit says to check."""
+    steps = _steps(conclusion, cell_file)
+    checks = _checks(conclusion)
+    if checks and steps == NOTHING_TO_DO:
+        return checks
+    return [*steps, *checks]
+
+
+def _checks(conclusion: Conclusion) -> list[str]:
+    """What a good calibration says to check, a line each; a failed check of another outcome says itself what to do."""
+    if conclusion.session is None or not conclusion.outcome.good:
+        return []
+    calibration = calibration_of_session(conclusion.session)
+    if calibration is None:
+        return []
+    return [f"CHECK {one.subject}: {one.remedy}" for one in calibration.diagnoses]
+
+
+def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
+    """List the next steps of an outcome."""
     session = conclusion.session
     outcome = conclusion.outcome
     target = None if session is None else session.state.target
@@ -314,7 +337,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
         ],
         Outcome.STOPPED: ["remove the cause; the same command continues this session while it is recent"],
         Outcome.INTERRUPTED: ["nothing, or the same command again: it continues this session while it is recent"],
-    }.get(outcome, ["nothing"])
+    }.get(outcome, NOTHING_TO_DO)
 
 
 def _is_contradicted(state: SessionState) -> bool:

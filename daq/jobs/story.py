@@ -88,11 +88,11 @@ def _quick(fields: Fields) -> str:
     listed = ", ".join(f"{gain['axis']} {gain['value']:.4g} ± {gain['std_percent']:.2f} %" for gain in gains)
     beside_target = f"target ± {gains[0]['target_percent']:g} %: {listed}."
     if fields["is_held_out"]:
-        return f"This block is held out, its moves do not count. Quick estimate so far, {beside_target}"
-    head = f"Quick estimate after move {fields['move']} of {fields['moves']}, {beside_target}"
+        return f"Held out, not counted. Quick estimate so far, {beside_target}"
+    head = f"Quick estimate, move {fields['move']} of {fields['moves']}, {beside_target}"
     left_s = fields["left_s"]
     if left_s <= 0.0:
-        return f"{head} All at the target so far; the end of the block decides."
+        return f"{head} All at the target; the end of the block decides."
     return f"{head} {gains[0]['axis']} is worst ({fields['why']}): about {duration(left_s)} left."
 
 
@@ -105,13 +105,23 @@ def _time_is_up(fields: Fields) -> str:
 
 def _recorded(fields: Fields) -> str:
     lost = fields["lost_cycles"]
-    return f"Recorded {fields['samples']} samples, {lost or 'none'} lost."
+    return f"{lost} of {fields['samples']} samples lost." if lost else ""
+
+
+def _found(fields: Fields) -> str:
+    """Return a sentence of what was found; the page has those of the details."""
+    return f"  {fields['text']}" if fields["in_short"] else ""
+
+
+def _compared(fields: Fields) -> str:
+    """Return how the gains compare; where they differ, the change that is shown next says it."""
+    return "" if fields["differs"] else f"\nCompared with the current gains, {fields['words']}."
 
 
 def _identifying(fields: Fields) -> str:
     count = len(fields["logs"])
     held_out = ", ".join(name.removesuffix(".mcap") for name in fields["holdout"])
-    return f"\nIdentifying all gains from {count} blocks; {held_out} is held out, to judge the model."
+    return f"\nIdentifying from {count} blocks; {held_out} judges the model."
 
 
 PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
@@ -120,34 +130,33 @@ PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
     "quick estimate": _quick,
     "time is up": _time_is_up,
     "identifying": _identifying,
+    "found": _found,
+    "compared with the gains in the controller": _compared,
 }
 """What a person reads of an event where that is more than a sentence with its fields."""
 
 SENTENCES = {
-    "session begun": "A new session begins. Its files are in {folder}.",
+    "session begun": "New session: {folder}",
     "session taken up": "The session continues. Already recorded: {recorded}.",
     "an unfinished session is not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
-    "the interlock lets the robot move": "Checked: disk, history and interlock.",
-    "drives are as declared, without fault and without power": "Checked: the drives.",
-    "moves to look at": "\nLook at the moves of {run} first: {page}",
+    "drives are as declared, without fault and without power": "Checked: disk, history, interlock, drives.",
+    "moves to look at": "\nMoves to look at: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
     "recording is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is recorded again.",
     "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",
-    "weighed": "The moves show about {added_kg:.2g} kg more on the flange than without load.",
+    "weighed": "By the moves, {added_kg:.2g} kg more than without load.",
     "mistake in a block": "\n! {text}",
     "kept as it is": "{block} is used as it is.",
     "the blocks so far do not give the gains": "\n! The blocks so far give no gains: {text}",
-    "found": "  {text}",
     "certificate": "Certificate: {page}",
     "drift": "! {axis}: {text}",
-    "compared with the gains in the controller": "\nCompared with the current gains, {words}.",
     "a check failed": "✗ {text}",
-    "written to the controller's file": "Written to {file}. The previous content is in {backup}.",
+    "written to the controller's file": "Written. Previous content: {backup}",
     "proposed: an operator has to apply it": "Nothing was written.",
     "session ended": "",  # the end of the session or the error follows
-    "accepted": "✓ Accepted: {text}.",
+    "accepted": "✓ Accepted: {text}.\n",
     "not accepted": "✗ Not accepted: {text}. To undo the write: {undo}",
-    "certified": "Certificate {id}: {text}.",
+    "certified": "Certificate {id}",
 }
 """The sentence of each event, with its fields."""

@@ -5,6 +5,7 @@ The judgement is that of `drivegain apply`: the same gates, and the same test fo
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -25,7 +26,7 @@ from daq.report.fit import Errors
 from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import Refused
 from daq.report.text import minute_text
-from daq.writeback.gates.gate import Refusal
+from daq.writeback.gates.gate import Gate, Refusal
 from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
 from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
@@ -148,6 +149,7 @@ class CertificateReport(Report):
 FIT_ROLE = "fit"  #: Of a source
 BALANCED_PLACES = 0.5  #: Between the mean places of bare and of loaded runs in their order
 
+_CLAUSE_END = re.compile(r"[;:] |, with ")
 _ID_DIGITS = 12  #: As history and audit log shorten a digest
 
 
@@ -174,7 +176,7 @@ class AxisRow:
     def words(self) -> str:
         """Verdict in words."""
         if self.refusals:
-            return "; ".join(f"refused: {refusal.found}" for refusal in self.refusals)
+            return "; ".join(f"refused: {found_in_short(refusal)}" for refusal in self.refusals)
         return f"differs from the {self.change.compared_with.value}" if self.significant else "same within noise"
 
     @property
@@ -246,7 +248,16 @@ class Certificate:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence; of gains that are in force, who has written them."""
+        """The verdict in one sentence, and what to check first; of gains that are in force, who has written them."""
+        check = check_text(self.calibration)
+        # A refusal says itself what is wrong.
+        if not check or self.verdict is Verdict.REFUSED:
+            return self._verdict_sentence
+        return f"{self._verdict_sentence} {check}"
+
+    @property
+    def _verdict_sentence(self) -> str:
+        """The verdict by gains and checks."""
         differing = [row for row in self.shown if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
         furthest = "" if most is None else f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
@@ -288,7 +299,7 @@ class Certificate:
             return "the gains were held fixed (`--gains fixed`), so there is nothing to write"
         first, *others = self._failed
         more = f" (and {len(others)} more, below)" if others else ""
-        return f"{first.subject}: {first.found}, expected {first.expected}{more}"
+        return f"{first.subject}: {found_in_short(first)}, expected {first.expected}{more}"
 
     def _written_sentence(self, write: Event, changed: str) -> str:
         """Say who has written the gains, how they changed, and which check would refuse them today."""
@@ -301,6 +312,28 @@ class Certificate:
         if self._failed:
             sentence += f". Today a check refuses them: {self._reason}"
         return f"{sentence}."
+
+
+def check_text(calibration: Calibration) -> str:
+    """Name what is to be checked first, in one sentence; empty where nothing is."""
+    if not calibration.diagnoses:
+        return ""
+    first, *others = calibration.diagnoses
+    more = f" (and {len(others)} more)" if others else ""
+    return f"But CHECK {first.subject}: {finding_in_short(first.found)}{more}."
+
+
+def found_in_short(refusal: Refusal) -> str:
+    """Return what a check has found; of a wrong description the first clause, because a CHECK has all of it."""
+    if refusal.gate is Gate.DESCRIPTION:
+        return finding_in_short(refusal.found)
+    return refusal.found
+
+
+def finding_in_short(found: str) -> str:
+    """Return the first clause of what a diagnosis has found."""
+    first, *_ = _CLAUSE_END.split(found, maxsplit=1)
+    return first
 
 
 def certify(

@@ -76,6 +76,8 @@ def certificate_page(certificate: Certificate, consequence: str = "", details: S
     elif certificate.comparison.in_force is not None and certificate.verdict is not Verdict.REFUSED:
         look = ""
         sign = _SIGN[Verdict.READY]
+    if calibration.diagnoses and look == "quiet":
+        look = "act"
     return html_page(
         f"Calibration of cell {calibration.cell}, certificate {certificate.origin.id}",
         (
@@ -124,10 +126,13 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
 
 
 def _warnings(certificate: Certificate) -> Iterator[str]:
-    """Checks to make and actions to take; checks that failed alike are one entry."""
+    """Checks to make and actions to take; what a diagnosis says is said once, and checks that failed alike are one."""
     texts = warning_texts(certificate.calibration)
+    diagnosed = {one.found for one in certificate.calibration.diagnoses}
     failed: dict[str, list[str]] = {}
     for one in certificate.comparison.refusals:
+        if one.found in diagnosed:
+            continue
         failed.setdefault(f"found {one.found}; expected {one.expected}; {one.remedy}", []).append(one.subject)
     if texts or failed:
         yield html_list((*texts, *(f"{', '.join(subjects)}: {text}." for text, subjects in failed.items())))

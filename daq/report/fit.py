@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -38,10 +38,12 @@ from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.effects.effect import PlacedEffect
+from ident.errors import Diagnosis
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
+from ident.estimators.turned_geometry import GEOMETRY
 from ident.model.robot import Robot
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 
@@ -114,6 +116,8 @@ class CheckedGeometry(Report):
     hidden_zeros: list[str]
     #: Why each of them is hidden: by a symmetry of the arm, as the last link's, or by these moves.
     hidden_zero_causes: dict[str, ZeroHiddenBy]
+    #: Two axes each, whose zeros are seen one by one, and not where both are off.
+    hidden_zero_pairs: list[tuple[str, str]]
 
 
 class FitReport(CalibrationBody, Report):
@@ -188,7 +192,7 @@ def fit_view(
         *sigma_notes(fitted),
         *geometry_notes(fitted.description, axes, robot_of(fitted.cell)),
         *identifiability_notes(fitted, calibration.payload_mass),
-        *advice(fitted, needed_verdicts(fitted)),
+        *_advice_unless_turned(fitted, calibration),
     )
     yield from map(Sentence, notes)
     if comparison is not None:
@@ -425,7 +429,21 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Ro
         turn_std_deg = np.degrees(check.gravity.turn_std_rad)
         gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
     causes = {axes[axis]: zero_hidden_by(robot, axis) for axis in check.hidden_zeros}
-    return CheckedGeometry(gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes)
+    pairs = [(axes[first], axes[second]) for first, second in check.hidden_pairs]
+    return CheckedGeometry(
+        gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes, hidden_zero_pairs=pairs
+    )
+
+
+def _advice_unless_turned(fitted: Fit, calibration: Calibration) -> Iterator[str]:
+    """As `advice`; nothing in a geometry that is wrong: no number means anything there."""
+    if not names_turned_geometry(calibration.diagnoses):
+        yield from advice(fitted, needed_verdicts(fitted))
+
+
+def names_turned_geometry(diagnoses: Iterable[Diagnosis]) -> bool:
+    """Whether a fit says that gravity, a zero or the sense of a position is far from what is described."""
+    return any(one.name in GEOMETRY and not one.runs for one in diagnoses)
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:

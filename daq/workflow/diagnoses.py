@@ -333,10 +333,18 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | 
         if type(placed.effect) in DIAGNOSED_AS:
             values, deviations = coefficients_of(evidence.estimate, placed)
             diagnosis = _correction_diagnosis(placed, values, deviations, cell, given.model)
-            if check is not None:
+            if check is not None and not _is_settled(placed, check, evidence):
                 diagnosis = _beside_alike(diagnosis, placed, check, cell, given.model)
             found.append(diagnosis)
     return tuple(found)
+
+
+def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) -> bool:
+    """Whether a correction that the fit did not tell apart from others stands beside one of them in a model."""
+    for alike in check.alike:
+        if alike.contain(placed):
+            return all(placed_of(found) in evidence.effects for found in alike.findings)
+    return False
 
 
 def open_correction_diagnoses(
@@ -585,17 +593,23 @@ WHY_HIDDEN = {
 
 
 def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> str:
-    """Which zeros the data do not show, and why; empty where they show all, or were not asked.
+    """Which zeros the data do not show, alone or two together, and why; empty where they show all, or were not asked.
 
     Args:
         check: beside the fit.
         axes: their names.
         robot: as declared.
     """
-    if check is None or not check.hidden_zeros:
+    if check is None:
         return ""
+    said: list[str] = []
     hidden: dict[ZeroHiddenBy, list[str]] = {}
     for axis in check.hidden_zeros:
         hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
     parts = [f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}" for cause in ZeroHiddenBy if cause in hidden]
-    return f"Zeros that are not seen here: {'; '.join(parts)}."
+    if parts:
+        said.append(f"Zeros that are not seen here: {'; '.join(parts)}.")
+    if check.hidden_pairs:
+        pairs = ", ".join(f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs)
+        said.append(f"Not seen here where both zeros are off, one against the other: {pairs}.")
+    return " ".join(said)

@@ -423,7 +423,12 @@ def _with_description_after_search(closed: Fit) -> Fit:
     if beside is None:
         return replace(closed, description=replace(description, mistakes=()))
     # Gravity and hidden zeros stay those of the fit; mistakes and their company are those of the final model.
-    kept = replace(beside, gravity=description.gravity, hidden_zeros=description.hidden_zeros)
+    kept = replace(
+        beside,
+        gravity=description.gravity,
+        hidden_zeros=description.hidden_zeros,
+        hidden_pairs=description.hidden_pairs,
+    )
     return replace(closed, description=kept)
 
 
@@ -503,7 +508,9 @@ def close_loop(
         evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
-    steps = find_effects(evidence, rng, progress=progress, axes=places)
+    check = start.description
+    named = None if check is None else check.certain_mistakes
+    steps = find_effects(evidence, rng, progress=progress, axes=places, mistakes=named)
     if undecided is not Undecided.ALL_JOIN:
         join = undecided is Undecided.JOIN
         steps = accept_on_holdout(evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places)

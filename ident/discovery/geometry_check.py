@@ -8,6 +8,8 @@ left is fitted together with everything else, and must pass by the σ of that fi
 
 Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of the other. So the
 test is repeated beside what it has found until it finds nothing more, and all numbers are those of one fit together.
+Two that are wrong by opposite amounts turn only the link between them, and neither passes alone
+(`ident.discovery.pairs_of_zeros`).
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, wit
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
+from ident.discovery.pairs_of_zeros import PairOfZeros, pairs_that_pass, try_pairs
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
@@ -89,6 +92,12 @@ class GeometryCheck:
     mistakes: tuple[Finding, ...]
     hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
     alike: tuple[AlikeCorrections, ...] = ()  #: of each mistake that does not stand alone
+    hidden_pairs: tuple[tuple[int, int], ...] = ()  #: axes whose zeros are seen one by one, and not both at once
+
+    @property
+    def certain_mistakes(self) -> tuple[Finding, ...]:
+        """Mistakes that the data tell apart from every other correction."""
+        return tuple(one for one in self.mistakes if not any(alike.contain(placed_of(one)) for alike in self.alike))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +109,7 @@ class _Round:
     findings: tuple[Finding, ...]  #: of all corrections, the best first
     mistakes: tuple[Finding, ...]  #: what it has found
     corrected: Evidence | None  #: fitted with these; None without any
+    pairs: tuple[PairOfZeros, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +128,11 @@ class _Suspect:
     torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
     values: FloatArray  #: their coefficients, shape (p,)
     held_out_fall: float  #: fall of the whitened ‖e‖² on held-out moves
+
+    @property
+    def is_pair(self) -> bool:
+        """Whether it is two zeros that hide each other."""
+        return len(self.effects) > 1 and not self.is_of_currents
 
     @property
     def is_of_currents(self) -> bool:
@@ -151,6 +166,16 @@ class _Rivals:
                 others.append(found)
         return others
 
+    def has_better_fast(self, delay: Finding) -> bool:
+        """Whether a fast effect of the axis of a delay passes, and explains more than it does."""
+        if not isinstance(delay.effect, CLOCK):
+            return False
+        for found in self.findings:
+            is_fast = placed_of(found) in self.at_full_rate
+            if is_fast and found.passed and _is_of_axis(found, delay) and found.held_out_fall > delay.held_out_fall:
+                return True
+        return False
+
     def torque_nm(self, problem: SearchProblem, found: Finding) -> FloatArray:
         """Columns of a finding at the joints, shape (m, p, r)."""
         placed = PlacedEffect(found.effect, found.axis)
@@ -183,10 +208,12 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
         except TooFewMoves:  # of the corrected description, other moves may be valid
             break
     mistakes = _in_one_fit(rounds)
+    robot = evidence.model.robot
     return GeometryCheck(
         gravity=_gravity(evidence, first.problem),
         mistakes=mistakes,
-        hidden_zeros=_hidden_zeros(first.findings, evidence.model.robot),
+        hidden_zeros=_hidden_zeros(first.findings, robot),
+        hidden_pairs=_hidden_pairs(first.pairs, robot),
         alike=_all_alike(evidence, rounds, mistakes, rng, gates),
     )
 
@@ -203,21 +230,40 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
         TooFewMoves: there are too few moves to leave some out.
     """
     problem = _problem_at_rows(evidence)
-    of_geometry = _tested(problem, GEOMETRY)
-    screened = (*of_geometry, *try_delays(problem, rough_torque_rates(evidence)))
+    of_geometry = _not_late_yet(_tested(problem, GEOMETRY), evidence)
+    screened = (*of_geometry, *_not_late_yet(try_delays(problem, rough_torque_rates(evidence)), evidence))
     findings = rank_families(problem, screened, rng, gates)
-    if not any(found.passed for found in findings):
-        return _Round(evidence, problem, findings, (), None)
+    hidden = _hidden_zeros(findings, problem.model.robot)
+    pairs = try_pairs(problem, [family for family in of_geometry if family.axis not in hidden])
+    wrong_pairs = pairs_that_pass(problem, pairs, rng, gates)
+    if not any(found.passed for found in findings) and not wrong_pairs:
+        return _Round(evidence, problem, findings, (), None, pairs)
     rates_nm_s = torque_rates(evidence)
-    of_currents = try_delays(problem, rates_nm_s)
+    of_currents = _not_late_yet(try_delays(problem, rates_nm_s), evidence)
     tested = (*of_geometry, *of_currents)
     findings = rank_families(problem, tested, rng, gates)
     suspects = _suspects(problem, findings, of_currents, rates_nm_s)
-    rivals = _rivals(evidence, problem, tested, suspects, rng, gates)
+    of_pairs = tuple(_suspect_of(problem, pair) for pair in wrong_pairs)
+    rivals = _rivals(evidence, problem, tested, (*suspects, *of_pairs), rng, gates)
     settled = _first_that_stands(evidence, problem, suspects, rivals)
     if settled is None:
-        return _Round(evidence, problem, findings, (), None)
-    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected)
+        settled = _first_that_stands(evidence, problem, of_pairs, rivals)
+    if settled is None:
+        return _Round(evidence, problem, findings, (), None, pairs)
+    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected, pairs)
+
+
+def _not_late_yet(tested: Sequence[FamilyTrials], evidence: Evidence) -> tuple[FamilyTrials, ...]:
+    """Trials without delays of what the model has a delay of: a second one would only mend the form of the first."""
+    late = {placed.axis for placed in evidence.effects if isinstance(placed.effect, (Lag, LatePosition))}
+    has_skew = any(isinstance(placed.effect, TimeSkew) for placed in evidence.effects)
+    left: list[FamilyTrials] = []
+    for family in tested:
+        effect, _ = family.members[0]
+        is_second = has_skew if isinstance(effect, TimeSkew) else isinstance(effect, CLOCK) and family.axis in late
+        if not is_second:
+            left.append(family)
+    return tuple(left)
 
 
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
@@ -250,9 +296,8 @@ def _all_alike(
         if not isinstance(mistake.effect, GeometryEffect):
             continue
         others = tuple(placed_of(one) for one in mistakes if one is not mistake)
-        if not others:
-            beside = rounds[0]
-        else:
+        beside = _round_beside(rounds, evidence, others)
+        if beside is None:
             try:
                 beside = _ranked_beside(evidence, others, rng, gates)
             except UNFITTED:
@@ -262,6 +307,12 @@ def _all_alike(
             axes = axes_to_move([placed_of(one) for one in alike], evidence.model.robot, evidence.fit_runs)
             found.append(AlikeCorrections(alike, axes))
     return tuple(found)
+
+
+def _round_beside(rounds: Sequence[_Round], evidence: Evidence, others: Sequence[PlacedEffect]) -> _Round | None:
+    """The round that was made beside some mistakes and nothing else; None where there was none."""
+    effects = {*evidence.effects, *others}
+    return next((one for one in rounds if set(one.evidence.effects) == effects), None)
 
 
 def _ranked_beside(
@@ -323,6 +374,10 @@ def _suspects(
     return tuple(sorted(suspects, key=lambda one: -one.held_out_fall))
 
 
+def _suspect_of(problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
+    return _Suspect(pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum()))
+
+
 def _rivals(
     evidence: Evidence,
     problem: SearchProblem,
@@ -333,13 +388,13 @@ def _rivals(
 ) -> _Rivals:
     """Test everything that the suspects compete with, and they themselves, each beside all others.
 
-    A late current also competes with what is fast on its axis: presliding, a gear with a gap or a spring in it.
+    A late current or position also competes with what is fast on its axis: presliding, a gear with a gap or a spring in
+    it.
     """
     families = (*tested, *_tested(problem, _slow(EFFECTS)))
     late: set[int] = set()
     for suspect in suspects:
-        if suspect.is_of_currents:
-            late |= {placed.axis for placed in suspect.effects if placed.effect.has_axis}
+        late |= {one.axis for one in suspect.effects if isinstance(one.effect, CLOCK) and one.effect.has_axis}
     at_full_rate = _columns_at_full_rate(evidence, sorted(late)) if late else {}
     of_fast = problem.trials(at_full_rate.values())
     fast: list[FamilyTrials] = []
@@ -355,7 +410,7 @@ def _first_that_stands(
     """The best suspect that stands beside all rivals, and in the joint fit; None where none does."""
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
-        if not any(found.passed for found in own):
+        if not suspect.is_pair and not any(found.passed for found in own):
             continue
         best = suspects[0]
         if suspect is not best and not suspect.explains_beside(problem, best.torque_nm):
@@ -372,7 +427,8 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     """Whether a suspect explains more than every rival, or most of it beside the best.
 
     A late current must do so beside the effects of its own axis, too. Delays of currents do not compete with each
-    other: they were fitted together.
+    other: they were fitted together. A spring or a gap in a gear explains a part of what a delay does, and more: where
+    one passes and explains more than a delay of its axis, the delay is not named before that effect is in the model.
 
     Args:
         problem: around the fit.
@@ -384,6 +440,8 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     best = others[0]
     is_best = suspect.held_out_fall >= best.held_out_fall
     if not is_best and not suspect.explains_beside(problem, rivals.torque_nm(problem, best)):
+        return False
+    if any(rivals.has_better_fast(found) for found in own):
         return False
     if not suspect.is_of_currents:
         return True
@@ -433,14 +491,28 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
             covariance = np.diag(found.deviations**2)
         if impossible(settled.effect.coefficients, settled.coefficients, settled.deviations):
             continue
-        if suspect.is_of_currents and abs(float(settled.coefficients[0])) < LEAST_DELAY_S:
+        if suspect.is_of_currents and _is_unlikely_delay(settled):
             continue
         if in_noise(settled.coefficients, covariance, SHOWN):
             continue
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
         shown.append(settled)
-    return _Settled(tuple(shown), corrected) if shown else None
+    is_half = suspect.is_pair and len(shown) < len(own)  # the other zero alone has not passed
+    return _Settled(tuple(shown), corrected) if shown and not is_half else None
+
+
+def _is_unlikely_delay(found: Finding) -> bool:
+    """Whether the delay of currents is too short to be named, or is one that no drive has and that explains little.
+
+    A filter of a drive makes its current late. One that is early is a mistake of stamps, which is large; less is what
+    another effect leaves, or a loop that answers to the noise of its encoder.
+    """
+    delay_s = float(found.coefficients[0])
+    if abs(delay_s) < LEAST_DELAY_S:
+        return True
+    is_early_alone = delay_s < 0.0 and isinstance(found.effect, Lag)
+    return is_early_alone and found.explained < Gates().smallest_share
 
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
@@ -479,12 +551,23 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
 def _hidden_zeros(findings: Sequence[Finding], robot: Robot) -> tuple[int, ...]:
     """Axes whose zero could be wrong by 2°, or 6 mm, without being named."""
     std_of = {found.axis: float(found.deviations[0]) for found in findings if isinstance(found.effect, ZeroOffset)}
-    hidden: list[int] = []
-    for axis, joint in enumerate(robot.axes):
-        largest = SEEN_ZERO_M if joint.kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
-        if is_placeable(ZeroOffset(), axis, robot) and std_of.get(axis, np.inf) > largest:
-            hidden.append(axis)
+    placeable = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
+    return tuple(axis for axis in placeable if std_of.get(axis, np.inf) > _seen_std(robot, axis))
+
+
+def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int, int], ...]:
+    """Axes whose zeros could be wrong by opposite amounts without being named, although each alone would be."""
+    hidden: list[tuple[int, int]] = []
+    for pair in pairs:
+        largest = np.array([_seen_std(robot, axis) for axis in pair.axes])
+        if np.any(pair.deviations > largest):
+            hidden.append(pair.axes)
     return tuple(hidden)
+
+
+def _seen_std(robot: Robot, axis: int) -> float:
+    """Largest σ of a zero that is seen [rad or m]."""
+    return SEEN_ZERO_M if robot.axes[axis].kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
 
 
 def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tuple[FamilyTrials, ...]:

@@ -27,6 +27,7 @@ from ident.discovery.gates import (
     values_of,
     whitened_columns,
 )
+from ident.discovery.geometry_check import CLOCK, check_geometry
 from ident.discovery.joining import (
     UNFITTED,
     JointFit,
@@ -39,6 +40,7 @@ from ident.discovery.joining import (
     linearised_after,
     refuted_by_structure,
 )
+from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
 from ident.discovery.resonance import propose_resonances
 from ident.discovery.ripple import propose_orders
 from ident.discovery.rotor_search import propose_rotors
@@ -57,6 +59,7 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
+from ident.errors import TooFewMoves
 
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
 PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
@@ -99,10 +102,12 @@ def find_effects(
     progress: Callable[[str], None] = lambda _: None,
     axes: Sequence[str] = (),
     geometry: tuple[tuple[Effect, ...], ...] = GEOMETRY,
+    mistakes: Sequence[Finding] | None = None,
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
-    Each turn of the loop:
+    Mistakes of the description that a check names join first, and delays that it names behind the search
+    (`check_geometry`, `join_mistakes`). Each turn of the loop:
 
     1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every axis: its columns,
        made from the motion and the predicted load and current, are projected off all declared directions, and the fall
@@ -137,19 +142,41 @@ def find_effects(
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
         geometry: the part of the dictionary that corrects the description of the robot.
+        mistakes: that the check has named beside this start; when None, and there is a geometry, it is made here.
 
     Returns:
-        the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
+        the turns taken, one of each mistake first; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
     gates, cache = gates or Gates(), ColumnCache()
     model = linearised(start, cache)
     names = axes or [joint.name for joint in start.model.robot.places]
     steps: list[Step] = []
-    seen = {keys_of(start)}
+    if mistakes is None:
+        mistakes = _named_mistakes(start, rng, gates) if geometry else ()
+    delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
+    corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
+    if corrections:
+        progress("adding what the check of the description has named")
+        corrected = join_mistakes(model, corrections, rng, gates)
+        steps += _steps_of(corrected, mistakes, detection_limits_nm(model.search_problem, gates))
+        model = corrected.model
+    of_check = len(steps)  # turns whose rivals were compared in the check
+    is_delay_open = bool(delays)
+    seen = {keys_of(start), keys_of(model.evidence)}
     for _ in range(MAX_EFFECTS):
         step, joined = _turn(model, rng, gates, (*geometry, *families), seen, progress, names)
-        if steps:
+        if len(steps) > of_check:
             steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
+        if joined is None and is_delay_open:
+            is_delay_open = False
+            progress("testing the clock beside what was found")
+            late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
+            if late.joined:
+                steps += _steps_of(late, late.joined, step.limits_nm)
+                of_check = len(steps)
+                model = late.model
+                seen.add(keys_of(model.evidence))
+                continue
         steps.append(step)
         if joined is None:
             break
@@ -158,6 +185,23 @@ def find_effects(
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
     return (*steps[:-1], end_search(steps, model, gates, rng=rng))
+
+
+def _named_mistakes(start: Evidence, rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
+    """What the check of the description and of the clock names for certain; nothing with too few moves."""
+    (own,) = rng.spawn(1)  # the draws of the search stay what they are
+    try:
+        return check_geometry(start, own, gates).certain_mistakes
+    except TooFewMoves:
+        return ()
+
+
+def _steps_of(corrected: JoinedMistakes, mistakes: Sequence[Finding], limits_nm: FloatArray) -> list[Step]:
+    """A turn for each mistake that has joined."""
+    steps: list[Step] = []
+    for found, after in zip(corrected.joined, corrected.models, strict=True):
+        steps.append(Step(tuple(mistakes), (), limits_nm, found, after, corrected.set_aside))
+    return steps
 
 
 def end_search(

@@ -134,13 +134,13 @@ def rank_families(
     if not tested:
         return ()
     trials = tuple(trial for family in tested for _, trial in family.members)
-    probability = _max_t(trials, rng, gates.draws)
+    probability = chances(trials, rng, gates.draws)
     effects = [effect for family in tested for effect, _ in family.members]
     is_known = np.array([effect.name in known for effect in effects])
     is_geometry = np.array([isinstance(effect, GeometryEffect) for effect in effects])
     for alike in (is_known, is_geometry):
         if alike.any():
-            among_them = _max_t(tuple(trials[index] for index in np.flatnonzero(alike)), rng, gates.draws)
+            among_them = chances(tuple(trials[index] for index in np.flatnonzero(alike)), rng, gates.draws)
             probability[alike] = np.fmin(probability[alike], among_them)
     probabilities = iter(probability)
     before = search_problem.folds.square_sum(search_problem.folds.residual)
@@ -288,7 +288,7 @@ def _judge(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
-        deviations=_sigma(trial),
+        deviations=sigma_by_moves(trial),
         probability=chance,
         folds_better=folds_better,
         explained=explained,
@@ -313,16 +313,16 @@ def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     """
     is_richer = len(effect.coefficients) > fewest and not effect.settings.get("with_rotor")
     tolerance = 0.0 if is_richer else SIGMAS
-    return impossible(effect.coefficients, trial.coefficients, _sigma(trial), tolerance)
+    return impossible(effect.coefficients, trial.coefficients, sigma_by_moves(trial), tolerance)
 
 
-def _sigma(trial: CandidateTrial) -> FloatArray:
+def sigma_by_moves(trial: CandidateTrial) -> FloatArray:
     """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986), shape (p,)."""
     spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
     return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
 
 
-def _max_t(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
+def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all.
 
     A candidate that rests on few moves has a heavy tail, and would hide every other one: it competes with all, but the

@@ -432,7 +432,8 @@ def exchange_shown_by(evidence: ChannelEvidence, axes: Sequence[str]) -> Diagnos
             for motor in moved
         ),
         "each current to follow from the motion of its own axis",
-        "exchange these currents: the drives' node numbers in the cell, or the columns of the import",
+        "exchange these currents: the drives' node numbers in the cell, and record again, because a log keeps those "
+        "that it was recorded with; or the columns of the import, and import again",
     )
 
 

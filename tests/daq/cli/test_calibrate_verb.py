@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import io
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+import typer
 
-from daq.cli.calibrate import Looks
+from daq.cli.calibrate import Looks, show_check
+from daq.errors import ExitCode
+from daq.jobs.calibrate import CheckLine
 from daq.jobs.journal import Form
 from daq.jobs.story import Story
 from daq.log.feed import Feed, QuickGain, QuickLook
+from drivers.errors import BusError
 
 LOOK = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)])
 
@@ -28,11 +33,10 @@ def test_a_look_is_printed_where_the_errors_go_now(looks: Looks, capsys: pytest.
     """A progress bar replaces the stream while it is shown."""
     looks.show(LOOK)
     looks.show(replace(LOOK, move=4))
+    looks.show(replace(LOOK, move=5, gains=[replace(LOOK.gains[0], std_percent=0.1)]))
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[0] for line in said] == [
-        "Quick estimate after move 3 of 9",
-        "Quick estimate after move 4 of 9",
-    ]
+    assert [line.split(",")[1] for line in said] == [" move 3 of 9", " move 5 of 9"]
+    assert looks.remark == "moves, J1 ± 0.10 % (target 0.5 %)"
 
 
 def test_a_look_that_comes_after_its_block_does_not_disturb_the_operator(
@@ -50,3 +54,16 @@ def test_what_is_missing_is_printed_once_in_a_block(looks: Looks, capsys: pytest
     for move in (1, 2, 3):
         looks.show(replace(waiting, move=move))
     assert capsys.readouterr().err == "No gains yet: no payload.\n"
+
+
+def test_a_check_that_fails_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    refused = BusError("virtual:127.0.0.1:29536", "Connection refused")
+    refused.__cause__ = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+    with pytest.raises(typer.Exit) as ended:
+        show_check((CheckLine("cell file", "6 axes"), CheckLine("disk, interlock, drives", "", refused)))
+    assert ended.value.exit_code == ExitCode.CONFIGURATION
+    first, failed, *parts = capsys.readouterr().out.splitlines()
+    assert first == "✓ cell file: 6 axes"
+    assert failed == "✗ disk, interlock, drives"
+    assert [line.split(":")[0].strip() for line in parts] == ["error", "found", "expected", "do"]
+    assert "drivegain simulate demo" in parts[-1]

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 from daq.cli.app import main
+from daq.cli.fit import end_if_turned
 from daq.cli.next_step import (
     FolderRuns,
     free_name,
@@ -25,6 +27,7 @@ from daq.cli.next_step import (
 )
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.errors import ExitCode
 from daq.workflow import plan as plan_module
 from daq.workflow.plan import Plan, load_plan, save_plan
 from ident.calibration import AcceptedEffect
@@ -260,3 +263,25 @@ def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     assert "Replaced: plan.yaml (of" in said
     assert "Replaced: plan.html (of" in said
     assert plan_module.plan_head(Path("plan.yaml")).seed == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "runs", "code"),
+    [
+        ("position-reversed", (), ExitCode.DATA_UNFIT),
+        ("zero-turned", (), ExitCode.DATA_UNFIT),
+        ("position-reversed", ("held-out",), None),
+        ("zero-off", (), None),
+    ],
+)
+def test_a_fit_in_a_turned_geometry_ends_as_one_that_is_refused(
+    name: str, runs: tuple[str, ...], code: ExitCode | None
+) -> None:
+    diagnosis = Diagnosis(name, runs, ("J2",), "another way", "its axis", "correct it")
+    calibration = replace(demo_calibration(), diagnoses=(diagnosis,))
+    if code is None:
+        end_if_turned(calibration)
+        return
+    with pytest.raises(typer.Exit) as ended:
+        end_if_turned(calibration)
+    assert ended.value.exit_code == code

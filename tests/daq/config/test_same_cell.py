@@ -75,6 +75,16 @@ def test_another_cell_is_refused_with_what_shows_it(kind: str, checkout: Path, t
         load_run(log, other)
 
 
+def test_a_log_of_exchanged_node_numbers_is_to_be_recorded_again(checkout: Path, log: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    first, second, *others = cell.axes
+    exchanged = (replace(first, node_id=second.node_id), replace(second, node_id=first.node_id), *others)
+    with pytest.raises(
+        LogsDiffer, match=r"node id 1 of axis J1; expected 2.*record again with the corrected cell file"
+    ):
+        load_run(log, replace(cell, axes=exchanged))
+
+
 @pytest.mark.parametrize("name", ["gantry", "dualv", "five-bar", "seven-axis"])
 def test_a_robot_with_another_number_of_axes_is_another_one(name: str, checkout: Path, log: Path) -> None:
     with pytest.raises(LogsDiffer, match=f"a log of cell 'demo'; expected one of cell '{name}'"):

@@ -54,6 +54,7 @@ class MadeSession(Made):
             super().tools(rig, **factors),
             plan=self._plan_of,
             look=lambda *_: BlockFacts(),
+            geometry=lambda *_: None,
             preview=lambda _cell, _plan, _file, page: page.touch(),
             validate=predicted,
         )

@@ -140,10 +140,13 @@ def test_what_is_left_shrinks_by_each_block(first_ratio: float) -> None:
     assert left == list(range(len(steps) - 1, 0, -1))
 
 
+NO_LIMIT = 1000  #: Blocks
+
+
 @given(st.floats(0.01, float(MOST_BARE_FIRST)))
 def test_where_the_prediction_is_right_the_payload_is_mounted_once(ratio: float) -> None:
     """σ² of n bare and n loaded blocks is that of one of each over n."""
-    roles = first_blocks(bare_blocks_first(ratio))
+    roles = first_blocks(bare_blocks_first(ratio, NO_LIMIT))
     bare = roles.count(BlockRole.BARE)
     assert bare == max(1, ceil(ratio - ROUNDING))
     so_far = BlocksSoFar(bare=bare, loaded=1, is_mounted=True)
@@ -158,7 +161,14 @@ def test_where_the_prediction_is_right_the_payload_is_mounted_once(ratio: float)
 
 @pytest.mark.parametrize("ratio", [50.0, float("inf"), float("nan")])
 def test_a_prediction_that_is_far_off_costs_a_few_blocks_at_most(ratio: float) -> None:
-    assert bare_blocks_first(ratio) == MOST_BARE_FIRST
+    assert bare_blocks_first(ratio, NO_LIMIT) == MOST_BARE_FIRST
+
+
+@pytest.mark.parametrize(("blocks_in_time", "bare"), [(1, 1), (3, 1), (5, 2), (6, 2), (9, 4), (13, 6), (40, 6)])
+def test_a_session_too_short_for_its_target_keeps_half_of_its_time_for_the_payload(
+    blocks_in_time: int, bare: int
+) -> None:
+    assert bare_blocks_first(100.0, blocks_in_time) == bare
 
 
 def test_every_session_begins_with_what_gives_the_gains() -> None:

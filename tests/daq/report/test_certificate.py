@@ -35,6 +35,7 @@ from ident.effects.effect import PlacedEffect
 from ident.effects.friction import LoadFriction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
+from ident.errors import Diagnosis
 from tests.daq.calibrations import (
     IDENTIFIED,
     NAMEPLATE,
@@ -211,6 +212,32 @@ def test_the_verdict_is_that_of_the_gates() -> None:
     assert refused.verdict is Verdict.REFUSED
     assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
     assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
+
+
+ZERO_OFF = Diagnosis(
+    "zero-off", (), ("J2",), "the zero of J2 off by +2.00 ± 0.05 °; explained as well by J3", "the URDF's", "correct it"
+)
+REVERSED = Diagnosis(
+    "position-reversed", (), ("J2",), "a position that counts the other way: so read, it leaves 3 %", "its axis", "turn"
+)
+
+
+def test_the_verdict_names_what_is_to_be_checked() -> None:
+    calibration = replace(demo_calibration(), diagnoses=(ZERO_OFF,))
+    certificate = certify(calibration, replace(without_controller(calibration, "", NOW), refusals=()))
+    assert certificate.verdict is Verdict.NOT_COMPARED
+    assert certificate.sentence.endswith(" But CHECK J2: the zero of J2 off by +2.00 ± 0.05 °.")
+    assert "verdict act" in certificate_page(certificate)
+    both = replace(calibration, diagnoses=(ZERO_OFF, REVERSED))
+    certificate = certify(both, replace(without_controller(both, "", NOW), refusals=()))
+    assert certificate.sentence.endswith("± 0.05 ° (and 1 more).")
+
+
+def test_a_wrong_description_that_refuses_a_write_is_said_once() -> None:
+    calibration = replace(demo_calibration(), diagnoses=(REVERSED,))
+    certificate = certify(calibration, without_controller(calibration, "", NOW))
+    assert certificate.sentence == ("Must not be written: J2: a position that counts the other way, expected its axis.")
+    assert certificate_page(certificate).count("so read, it leaves 3 %") == 1
 
 
 def test_without_a_controller_no_message_names_a_current_gain() -> None:

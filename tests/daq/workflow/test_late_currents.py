@@ -75,3 +75,10 @@ def test_the_zero_of_a_slide_that_shifts_the_whole_arm_is_hidden_by_symmetry() -
     said = hidden_zeros_text(check, ("X", "Y", "Z", "A"), gantry_truth().model.robot)
     why = "another one turns or shifts the whole arm, and no torque depends on that"
     assert said == f"Zeros that are not seen here: of X, Y: {why}."
+
+
+def test_two_zeros_that_are_seen_one_by_one_only_are_named_together(cell: Cell) -> None:
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), hidden_pairs=((1, 2), (2, 4)))
+    said = hidden_zeros_text(check, cell.axis_names, model_of(cell).robot)
+    assert said.startswith("Not seen here where both zeros are off, one against the other")
+    assert said.endswith("J2 with J3, J3 with J5.")

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import signal
 
 from ident.calibration import calibration_of
 from ident.data.run import Run
@@ -231,6 +232,19 @@ def test_the_check_names_what_is_late_with_its_delay(name: str) -> None:
     assert [(one.effect.name, one.axis) for one in found] == [(effect, axis) for effect, axis, _ in delays.said]
     for one, (_, _, delay_ms) in zip(found, delays.said, strict=True):
         assert abs(one.coefficients[0] - 1e-3 * delay_ms) < 3.0 * one.deviations[0] < 1e-3
+
+
+def test_a_current_behind_a_filter_is_late_once() -> None:
+    """A delay fits its beginning alone; the position of that joint is not late as well."""
+    runs: list[Run] = []
+    for run in _runs()[:4]:
+        share = 1.0 - np.exp(-1.0 / (500.0 * 0.008))
+        current = run.current_a.copy()
+        current[:, 1] = signal.lfilter([share], [1.0, share - 1.0], current[:, 1] - current[0, 1]) + current[0, 1]
+        runs.append(replace(run, current_a=current))
+    check = check_geometry(gathered(three_axes_truth(), tuple(runs)), np.random.default_rng(0), GATES)
+    assert [(one.effect.name, one.axis) for one in check.mistakes] == [("lag", 1)]
+    assert check.mistakes[0].coefficients[0] == pytest.approx(0.008, rel=0.2)
 
 
 def test_undeclared_friction_is_no_late_current() -> None:

@@ -15,6 +15,7 @@ from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import Gates
+from ident.discovery.geometry_check import check_geometry
 from ident.discovery.loop import find_effects
 from ident.discovery.search import rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
@@ -336,6 +337,17 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
     assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))
     assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
+
+
+FAST = ("elasticity", "backlash", "presliding", "coupling")
+"""Families of torques that change where a motion does, as what is late does."""
+
+
+@pytest.mark.parametrize("planted", [one for one in SMALL_CASES if one.family in FAST], ids=lambda one: one.family)
+def test_a_fast_effect_is_no_delay_and_no_wrong_zero(small_arm: Arm, planted: Planted) -> None:
+    """The check of the description called a spring in the gear of J1 a position that is early by 3.5 ms."""
+    check = check_geometry(_with(small_arm, planted), np.random.default_rng(0), GATES)
+    assert check.mistakes == ()
 
 
 def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effect, float, float]:
