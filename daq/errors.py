@@ -1,7 +1,7 @@
 """Errors of the service, and the exit code of every error of the three packages.
 
 DaqError
-├── UsageError            exit 2
+├── UsageError            exit 2    PlanTooShort
 ├── CalibrationRefused    exit 3    ControllerUnfit, ControllerChanged, SignatureInvalid, AuditUnusable
 ├── DataError             exit 4    CalibrationMissing, CalibrationUnreadable, TableUnfit, HistoryUnreadable,
 │   │                               LogsDiffer, LogRepeated, RunInvalid, CyclesLost, ClockImplausible,
@@ -90,6 +90,10 @@ def evidence(error: Exception) -> str:
 
 class UsageError(DaqError):
     """The command asks for something that cannot be done."""
+
+
+class PlanTooShort(UsageError):
+    """The duration of a plan has no room for moves that are enough; a longer one has."""
 
 
 class CalibrationRefused(DaqError):

@@ -149,6 +149,7 @@ class Block(StrictModel):
     mass_kg: float | None  #: None without load
     holdout: bool  #: not used by the fit
     plan: str  #: file name of its moves
+    duration_s: float = 0.0  #: that its moves had room for [s]; 0 in sessions of earlier versions
 
 
 class GainSoFar(StrictModel):
@@ -203,6 +204,7 @@ class GuidedState(SessionState):
     blocks: tuple[Block, ...] = ()
     mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
     rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
+    block_s: float = 0.0  #: duration of the blocks that are to come [s], where it is longer than the asked one
     bare_first: Annotated[int, Field(ge=1)] = 1  #: number of bare blocks before the first one with the payload
     gains: tuple[GainSoFar, ...] = ()  #: after the last block that was judged
     judged_blocks: _Count = 0  #: number of blocks behind these gains

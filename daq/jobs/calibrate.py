@@ -16,7 +16,7 @@ from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
 from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
 from daq.jobs.gain_target import target_of
-from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise, fit_corrected_command
+from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise, fit_corrected_command, plan_with_room
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.position import goes_on_with
@@ -25,6 +25,7 @@ from daq.jobs.session import Basis, Session
 from daq.jobs.stages import TO_DECISION, Certify, Stage, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
+from daq.workflow.plan import Plan
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
 from ident.errors import ChannelsExchanged, GeometryTurned
@@ -210,7 +211,10 @@ def _ready_text(context: SessionContext) -> str:
 
 
 def _predicted_text(context: SessionContext, block_s: float) -> str:
-    plan = context.tools.plan(context.cell, seed=context.settings.seed, duration_s=block_s)
+    def make(duration_s: float) -> Plan:
+        return context.tools.plan(context.cell, seed=context.settings.seed, duration_s=duration_s)
+
+    plan, _ = plan_with_room(context, block_s, make)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
     return f"predicted σ after one bare and one loaded block: {listed}"

@@ -6,13 +6,15 @@ one change of the payload is enough. `block_order` says how many are bare, and w
 The moves are for all gains until these are known. Those of every later block are for the gain that is farthest from its
 target by then. From the fourth block on, moves stay inside the room and the speed of the first three, which the
 operator has looked at.
+
+Where a block of the asked duration has no room for enough moves, it takes longer, and so do all later ones.
 """
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
@@ -25,7 +27,7 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import DEFAULT_TARGET_SIGMA_PERCENT
 from daq.config.recalibration import PlannedRun
 from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
-from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, writing
+from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, PlanTooShort, writing
 from daq.jobs.block_check import compared_with, mistake_in
 from daq.jobs.block_order import (
     FIRST_BLOCKS,
@@ -51,6 +53,7 @@ from ident.estimators.turned_geometry import GEOMETRY
 from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
+MOST_DOUBLINGS = 3  #: Of the duration of blocks, where the asked one has no room for enough moves
 MAX_REPETITIONS = 3  #: Of one block, before the session is held
 CORRECTED = "corrected.yaml"  #: Calibration of the blocks of a session by a corrected cell file
 
@@ -62,7 +65,7 @@ class GuidedSettings:
     folder: Path  #: parent of the sessions
     payload: str  #: name of the body for the loaded blocks
     target_percent: float = DEFAULT_TARGET_SIGMA_PERCENT  #: σ of each gain at which the recording ends
-    block_s: float = 20.0  #: duration of a block [s]
+    block_s: float = 20.0  #: duration of a block [s]; where it has no room for enough moves, blocks are longer
     time_limit_min: float = 30.0  #: motion after which the recording ends, precise or not [min]
     warm_up_min: float = 0.0
     retries: int = 1
@@ -133,24 +136,29 @@ class UntilPrecise:
             payload = self.settings.payload
             mass_kg = state.mass_kg or context.operator.weigh(payload)
             session = session.update(mass_kg=mass_kg)
+        path = session.folder / plan_name(number)
+        if number < len(FIRST_BLOCKS):
+            session, plan = self.plan_block(context, session, name, number, path)
+            session = session.update(bare_first=self._bare_first(context, guided(session), plan, number))
+        else:
+            session, plan = self._later_plan(context, session, number, path)
+            say_moves(context, name, path)
         block = Block(
             name=name,
             payload=payload,
             mass_kg=mass_kg,
             holdout=role is BlockRole.HELD_OUT,
-            plan=plan_name(number),
+            plan=path.name,
+            duration_s=self.block_s(guided(session)),
         )
-        path = session.folder / block.plan
-        if number < len(FIRST_BLOCKS):
-            plan = self.plan_block(context, name, number, path)
-            session = session.update(bare_first=self._bare_first(context, state, plan, number))
-        else:
-            plan = self._later_plan(context, session, number, path)
-            say_moves(context, name, path)
         # In the place of one that is recorded again.
         blocks = (*state.blocks[:number], block, *state.blocks[number:])
         session = session.update(blocks=blocks)
         return session, NextRun(_planned(session, block), plan)
+
+    def block_s(self, state: GuidedState) -> float:
+        """Duration of the blocks that are to come [s]."""
+        return max(self.settings.block_s, state.block_s)
 
     def _role_of(
         self, context: SessionContext, state: GuidedState, gains: Sequence[GainSoFar], number: int
@@ -173,8 +181,8 @@ class UntilPrecise:
         mounted = {block.name: block.payload is not None for block in state.blocks}
         recorded = [run.name for run in state.runs if run.name in mounted]
         so_far = blocks_so_far(state.blocks, is_mounted=mounted[recorded[-1]])
-        block_s = self.settings.block_s
-        until_limit_s = 60.0 * self.settings.time_limit_min - block_s * len(state.blocks)
+        block_s = self.block_s(state)
+        until_limit_s = 60.0 * self.settings.time_limit_min - motion_s(state.blocks, self.settings.block_s)
         most = max(1, math.floor(until_limit_s / block_s))
         way = quickest_way(so_far, _variance_ratio(gains), block_s, most)
         return next_role(so_far, way)
@@ -185,7 +193,7 @@ class UntilPrecise:
         if number or not context.cell.friction_by_payload or not predicted_percent:
             return state.bare_first
         worst = max(predicted_percent) / self.settings.target_percent
-        blocks_in_time = math.floor(60.0 * self.settings.time_limit_min / self.settings.block_s)
+        blocks_in_time = math.floor(60.0 * self.settings.time_limit_min / self.block_s(state))
         return bare_blocks_first(worst**2, blocks_in_time)
 
     def after_run(self, context: SessionContext, session: Session) -> Session:
@@ -242,33 +250,33 @@ class UntilPrecise:
             return session
         estimate = self._estimate(context, session)
         gains = estimate.gains
-        motion_s = recorded * self.settings.block_s
-        fitted_s = self.settings.block_s * sum(not block.holdout for block in state.blocks)
+        moved_s = motion_s(state.blocks, self.settings.block_s)
+        fitted_s = motion_s(_fitted(state.blocks), self.settings.block_s)
         left_s = motion_left_s(context.cell, gains, state.blocks, self.settings.block_s)
         progress = state.progress
         if gains:
             std_percent = tuple(gain.std_percent for gain in gains)
-            now = Progress(blocks=recorded, motion_s=motion_s, fitted_s=fitted_s, std_percent=std_percent)
+            now = Progress(blocks=recorded, motion_s=moved_s, fitted_s=fitted_s, std_percent=std_percent)
             progress = (*progress, now)
             context.journal.say(
                 Level.INFO,
                 "gains so far",
                 gains=[gain.model_dump() for gain in gains],
                 blocks=recorded,
-                motion_s=motion_s,
+                motion_s=moved_s,
                 left_s=left_s,
             )
         has_held_out = any(block.holdout for block in state.blocks)
         is_precise = bool(gains) and all(gain.is_precise for gain in gains) and has_held_out
-        is_time_up = motion_s >= 60.0 * self.settings.time_limit_min
+        is_time_up = moved_s >= 60.0 * self.settings.time_limit_min
         missing = ""
         would_help: tuple[str, ...] = ()
         if is_time_up and not is_precise:
             missing = _missing(gains, self.settings.time_limit_min)
-            would_help = _would_help(estimate, motion_s + left_s)
+            would_help = _would_help(estimate, moved_s + left_s)
             context.journal.say(Level.NOTICE, "time is up", missing=missing, would_help=would_help)
         elif not is_precise:
-            self._plan_next(context, session, estimate)
+            session = self._plan_next(context, session, estimate)
         return session.update(
             gains=gains,
             progress=progress,
@@ -278,31 +286,35 @@ class UntilPrecise:
             would_help=would_help,
         )
 
-    def _plan_next(self, context: SessionContext, session: Session, estimate: BlockEstimate) -> None:
+    def _plan_next(self, context: SessionContext, session: Session, estimate: BlockEstimate) -> Session:
         """Plan the next block for the worst gain; nothing is planned where the gains are not known yet."""
         outlook = estimate.outlook
         number = _next_number(guided(session))
         if outlook is None or number < len(first_blocks(guided(session).bare_first)):
-            return
+            return session
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
         role = self._role_of(context, guided(session), estimate.gains, number)
         is_loaded = role is not BlockRole.BARE
-        seed = self.settings.seed + number
-        duration_s = self.settings.block_s
-        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-        made = context.tools.plan(
-            context.cell,
-            seed=seed,
-            duration_s=duration_s,
-            speed=room.speed,
-            # More moves never make what is known worse.
-            largest_condition=np.inf,
-            largest_std_percent=np.inf,
-            experiment=outlook.experiment(experiment, is_loaded=is_loaded, room=room),
-            goal=outlook.goal(self.settings.target_percent),
-            box=room.box,
-        )
+        next_experiment = outlook.experiment(experiment, is_loaded=is_loaded, room=room)
+
+        def make(duration_s: float) -> Plan:
+            seed = self.settings.seed + number
+            context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+            return context.tools.plan(
+                context.cell,
+                seed=seed,
+                duration_s=duration_s,
+                speed=room.speed,
+                # More moves never make what is known worse.
+                largest_condition=np.inf,
+                largest_std_percent=np.inf,
+                experiment=next_experiment,
+                goal=outlook.goal(self.settings.target_percent),
+                box=room.box,
+            )
+
+        session, made = self._with_room(context, session, make)
         worst = estimate.worst
         axis = context.cell.axis_names.index(worst.axis)
         predicted_percent = float(outlook.scale[axis]) * made.predicted_std_percent[axis]
@@ -313,25 +325,38 @@ class UntilPrecise:
             "are no faster."
         )
         write_plan(context, session.folder / plan_name(number), replace(made, purpose=purpose))
+        return session
 
-    def _later_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
+    def _later_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> tuple[Session, Plan]:
         """Load the moves that were planned for the worst gain; where there are none, make some for all gains."""
         with suppress(ConfigurationError):  # what is missing or damaged is made again
-            return load_plan(path, context.cell)
+            return session, load_plan(path, context.cell)
         return self._unaimed_plan(context, session, number, path)
 
-    def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> Plan:
+    def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> tuple[Session, Plan]:
         """Make moves for all gains, inside the room of the first blocks."""
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
-        seed = self.settings.seed + number
-        duration_s = self.settings.block_s
-        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
         inside = replace(experiment, scene=room.scene(experiment.scene))
-        made = context.tools.plan(
-            context.cell, seed=seed, duration_s=duration_s, speed=room.speed, experiment=inside, box=room.box
-        )
-        return write_plan(context, path, made)
+
+        def make(duration_s: float) -> Plan:
+            seed = self.settings.seed + number
+            context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
+            return context.tools.plan(
+                context.cell, seed=seed, duration_s=duration_s, speed=room.speed, experiment=inside, box=room.box
+            )
+
+        session, made = self._with_room(context, session, make)
+        return session, write_plan(context, path, made)
+
+    def _with_room(
+        self, context: SessionContext, session: Session, make: Callable[[float], Plan]
+    ) -> tuple[Session, Plan]:
+        """Make a plan of the duration of a block; where it has to be longer, later blocks are, too."""
+        plan, block_s = plan_with_room(context, self.block_s(guided(session)), make)
+        if block_s > self.block_s(guided(session)):
+            session = session.update(block_s=block_s)
+        return session, plan
 
     def _accepted_room(self, context: SessionContext, session: Session, experiment: Experiment) -> AcceptedRoom:
         """Return room and speed of the first blocks, which the operator has looked at before they were recorded.
@@ -352,9 +377,15 @@ class UntilPrecise:
             )
         return accepted_room(context.cell, experiment.scene, plans)
 
-    def plan_block(self, context: SessionContext, name: str, number: int, path: Path) -> Plan:
+    def plan_block(
+        self, context: SessionContext, session: Session, name: str, number: int, path: Path
+    ) -> tuple[Session, Plan]:
         """Make the moves of one of the first blocks by its name, and its number from 0."""
-        return plan_moves(context, name, path, self.settings.seed + number, self.settings.block_s)
+
+        def make(duration_s: float) -> Plan:
+            return plan_moves(context, name, path, self.settings.seed + number, duration_s)
+
+        return self._with_room(context, session, make)
 
     def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
         """Estimate the gains of the blocks so far; none where they cannot be identified yet.
@@ -411,7 +442,7 @@ class Rehearse:
         for number in range(guided(session).rehearsed, len(FIRST_BLOCKS)):
             path = session.folder / plan_name(number)
             planned = PlannedRun(name=f"rehearsal-{number + 1}", plan_file=path)
-            moves = self.schedule.plan_block(context, planned.name, number, path)
+            session, moves = self.schedule.plan_block(context, session, planned.name, number, path)
             plan = slowed(context.cell, moves, self.speed)
             context.operator.mount(planned)
             context.journal.say(Level.INFO, "rehearsing", speed=self.speed, seconds=plan.duration_s)
@@ -434,6 +465,34 @@ def _next_number(state: GuidedState) -> int:
     """Return the number of the first block that is not there."""
     taken = {int(block.name.split("-")[1]) - 1 for block in state.blocks}
     return next(number for number in count() if number not in taken)
+
+
+def plan_with_room(context: SessionContext, duration_s: float, make: Callable[[float], Plan]) -> tuple[Plan, float]:
+    """Make a plan, of twice the duration where it has no room for enough moves, and so on; return both.
+
+    Args:
+        context: of the session.
+        duration_s: asked for.
+        make: makes the plan of a duration.
+
+    Raises:
+        PlanTooShort: even the longest one has no room.
+    """
+    for _ in range(MOST_DOUBLINGS):
+        try:
+            return make(duration_s), duration_s
+        except PlanTooShort as error:
+            asked_s = duration_s
+            duration_s *= 2.0
+            context.journal.say(
+                Level.NOTICE,
+                "longer blocks",
+                asked_s=asked_s,
+                found=error.found,
+                expected=error.expected,
+                duration_s=duration_s,
+            )
+    return make(duration_s), duration_s
 
 
 def plan_moves(context: SessionContext, run: str, path: Path, seed: int, duration_s: float) -> Plan:
@@ -527,12 +586,12 @@ def motion_left_s(cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block
         cell: with its model of friction, which the order of the blocks depends on.
         gains: so far.
         blocks: behind them.
-        block_s: duration of a block [s].
+        block_s: duration of a block that was asked for [s].
     """
     if not gains:
         return 0.0
     if not cell.friction_by_payload:
-        fitted_s = block_s * sum(not block.holdout for block in blocks)
+        fitted_s = motion_s(_fitted(blocks), block_s)
         std_percent = np.array([gain.std_percent for gain in gains])
         target_percent = np.array([gain.target_percent for gain in gains])
         return time_to_target(std_percent, target_percent, fitted_s).longest_s
@@ -542,7 +601,22 @@ def motion_left_s(cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block
     if not math.isfinite(ratio):
         return math.inf
     so_far = blocks_so_far(blocks, is_mounted=blocks[-1].payload is not None)
-    return block_s * quickest_way(so_far, ratio, block_s).count
+    last_s = blocks[-1].duration_s or block_s
+    return last_s * quickest_way(so_far, ratio, last_s).count
+
+
+def motion_s(blocks: Sequence[Block], block_s: float) -> float:
+    """Return the motion of blocks [s].
+
+    Args:
+        blocks: of the session.
+        block_s: duration of those that do not say it [s].
+    """
+    return sum(block.duration_s or block_s for block in blocks)
+
+
+def _fitted(blocks: Sequence[Block]) -> list[Block]:
+    return [block for block in blocks if not block.holdout]
 
 
 def blocks_so_far(blocks: Sequence[Block], *, is_mounted: bool) -> BlocksSoFar:

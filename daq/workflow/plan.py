@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
 from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
-from daq.errors import ConfigurationInconsistent, UsageError
+from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
@@ -165,7 +165,8 @@ class Search:
         """Clear random moves that fill the duration.
 
         Raises:
-            UsageError: it has no room for five moves, or no clear way is found.
+            PlanTooShort: it has no room for five moves.
+            UsageError: no clear way is found.
         """
         most: list[PlannedMove] = []
         for _ in range(MAX_STARTS):
@@ -179,7 +180,7 @@ class Search:
         longer_s = _tens(self._duration_s * WISHED_MOVES / max(len(most), 1))
         expected = f"at least {MIN_PLANNED_MOVES}, better {WISHED_MOVES}"
         remedy = f"allow a longer run (some --duration {longer_s:.0f})"
-        raise _unfit(self._cell, self._duration_s, found, expected, remedy)
+        raise _unfit(self._cell, self._duration_s, found, expected, remedy, PlanTooShort)
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
         moves = [self._clear_start()]
@@ -435,9 +436,11 @@ def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | Non
     return needed_s if needed_s <= LONGEST_S else None
 
 
-def _unfit(cell: Cell, duration_s: float, found: str, expected: str, remedy: str) -> UsageError:
+def _unfit(
+    cell: Cell, duration_s: float, found: str, expected: str, remedy: str, kind: type[UsageError] = UsageError
+) -> UsageError:
     subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
-    return UsageError(subject, found=found, expected=expected, remedy=remedy)
+    return kind(subject, found=found, expected=expected, remedy=remedy)
 
 
 _Way = tuple[tuple[float, ...], PlannedMove]
@@ -484,7 +487,8 @@ def plan(
         progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
-        UsageError: no plan of this length shows every gain, or there is no clear way.
+        PlanTooShort: a longer plan would show every gain, or have room for enough moves.
+        UsageError: no plan shows every gain, or there is no clear way.
         ConfigurationInconsistent: the cell declares no payload.
     """
     experiment = experiment or experiment_of(cell)
@@ -502,20 +506,24 @@ def plan(
     if not found <= largest_condition:
         condition = format_at_limit(found, largest_condition, 0)
         words = f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
-        remedy = _condition_remedy(experiment, duration_s, found / largest_condition)
-        raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
+        ratio = found / largest_condition
+        remedy = _condition_remedy(experiment, duration_s, ratio)
+        kind = PlanTooShort if _is_mended_by_time(duration_s, ratio) else UsageError
+        raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy, kind)
     used_s = experiment_duration_s(cell, draft.moves)
     if not predicted[worst] <= largest_std_percent:
         percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
         words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
         judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)])
         ways = ["allow more exchanges, wider joint limits or higher speed"]
+        kind = UsageError
         if np.isfinite(predicted[worst]):
             longer_s = longer_run_s(used_s, duration_s, float(predicted[worst]) / largest_std_percent)
             if longer_s is not None:
                 ways.insert(0, f"allow a longer run (some --duration {longer_s:.0f})")
+                kind = PlanTooShort
         remedy = ". ".join(("; or ".join(ways), *judged.sentences(cell.axis_names)))
-        raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
+        raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy, kind)
     return Plan(
         cell=cell.name,
         seed=seed,
@@ -530,12 +538,16 @@ def plan(
 MADE_BY_MORE_MOVES = 10.0  #: Ratio of two conditions that more moves make; a larger one is of the robot
 
 
+def _is_mended_by_time(duration_s: float, ratio: float) -> bool:
+    """Whether a run of twice the duration may lower a condition that is too large by a ratio."""
+    return ratio <= MADE_BY_MORE_MOVES and _tens(2.0 * duration_s) <= LONGEST_S
+
+
 def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -> str:
     """Say what lowers a condition that is too large by a ratio: more moves, or right angles that are right."""
-    longer_s = _tens(2.0 * duration_s)
     other = "more exchanges, wider joint limits or higher speed; `--condition` accepts more"
-    if ratio <= MADE_BY_MORE_MOVES and longer_s <= LONGEST_S:
-        return f"allow a longer run (some --duration {longer_s:.0f}), {other}"
+    if _is_mended_by_time(duration_s, ratio):
+        return f"allow a longer run (some --duration {_tens(2.0 * duration_s):.0f}), {other}"
     turned = nearly_right_joints(experiment.design.expectation.model.robot)
     if not turned:
         return f"allow {other}"

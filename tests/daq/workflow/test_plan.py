@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
-from daq.errors import ConfigurationInconsistent, UsageError
+from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError
 from daq.workflow.experiment import Experiment, experiment_of, paths_of
 from daq.workflow.plan import LONGEST_S, Plan, longer_run_s, nearly_right_joints, plan, slowed
 from drivers.move import Trapezoid
@@ -141,6 +141,18 @@ def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment:
         experiment_of(demo, "plate")
     assert caught.value.found == "no payload 'plate'"
     assert caught.value.expected == "disc"
+
+
+def test_a_plan_that_a_longer_run_mends_is_called_too_short(demo: Cell, experiment: Experiment) -> None:
+    with pytest.raises(PlanTooShort, match="room for"):
+        plan(demo, seed=1, duration_s=2.0, experiment=experiment)
+    with pytest.raises(PlanTooShort, match=r"condition .* allow a longer run"):
+        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_condition=100.0)
+    with pytest.raises(UsageError, match="condition") as refused:
+        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_condition=1.0)
+    assert not isinstance(refused.value, PlanTooShort)
+    with pytest.raises(PlanTooShort, match=r"predicted for the gain .* allow a longer run"):
+        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_std_percent=1.0)
 
 
 def test_a_slower_plan_keeps_its_ways(demo: Cell, experiment: Experiment) -> None:
