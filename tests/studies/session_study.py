@@ -3,6 +3,9 @@
     python -m tests.studies.session_study --only TX-40 --seeds 1 2
     python -m tests.studies.session_study --shard 1/4 --minutes 60      goes on where it ended
 
+A unit that ends with an error is a row with its reason: a missed target, and no ratio. `--tables
+docs/evidence/data` writes the tables of docs/evidence/session.md.
+
 Each shipped robot is calibrated over the driver by `daq.jobs.calibrate.calibrate`, until σ of every gain is 0.5 %. The
 time is that of the motion, and three minutes for each change of the payload. Its cell file has `friction_by_payload`,
 as those that `drivegain init` writes. Step by step it is the shortest of five durations of a plan whose three runs
@@ -14,10 +17,11 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -31,9 +35,10 @@ from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
+from daq.errors import DaqError, PlanTooShort
 from daq.jobs.calibrate import calibrate
 from daq.jobs.context import Tools
-from daq.jobs.guided import GuidedSettings, guided
+from daq.jobs.guided import GuidedSettings, guided, motion_s
 from daq.jobs.journal import Form, Journal
 from daq.jobs.operator import GivenAnswers
 from daq.jobs.recording import calibration_of_session
@@ -43,11 +48,13 @@ from daq.workflow.fit import close_loop, fit
 from daq.workflow.plan import plan
 from daq.workflow.record import Recorded, RecordingRequest, record
 from drivers.canopen.bus import open_bus
+from drivers.errors import DriverError
 from drivers.simulation.cell import SimulatedCell
 from ident.errors import IdentificationError
 from tests.studies.any_robot import ROBOTS, StudiedRobot
-from tests.studies.fingerprint import digest, digest_of_source, made_once
+from tests.studies.fingerprint import digest, digest_of_source, is_finished, made_once
 from tests.studies.output import print_line
+from tests.studies.session_tables import summary, write_tables
 from tests.studies.side_by_side import Shard, shard
 from tests.studies.study_rows import work_off
 
@@ -55,7 +62,6 @@ OUT = Path("out/session-study")
 SEEDS = tuple(range(1, 21))
 TARGET_PERCENT = 0.5
 TRUE_ERROR_PERCENT = 1.0
-CHANGE_S = 180.0  #: For each change of the payload
 DURATIONS_S = (10.0, 20.0, 40.0, 80.0, 160.0)
 BLOCK_S = 10.0
 EXCHANGES = 200
@@ -89,7 +95,7 @@ class Plant:
 
 
 def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
-    """Both ways for one seed."""
+    """Both ways for one seed; of a way that ends with an error, its reason."""
     shutil.copytree(shipped_configurations(), folder / "configs")
     cell_file = folder / "configs" / "cells" / f"{robot.cell}.yaml"
     cell = load_cell(cell_file)
@@ -100,9 +106,17 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
     return {
         "robot": robot.name,
         "seed": seed,
-        "guided": guided_way(plant, by_payload_file, load_cell(by_payload_file), folder),
-        "step_by_step": step_by_step(plant, cell_file, cell, folder),
+        "guided": way_or_reason(lambda: guided_way(plant, by_payload_file, load_cell(by_payload_file), folder)),
+        "step_by_step": way_or_reason(lambda: step_by_step(plant, cell_file, cell, folder)),
     }
+
+
+def way_or_reason(make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a way found; the class and the text of the error that ended it under `failed`."""
+    try:
+        return make()
+    except (DaqError, DriverError, IdentificationError) as error:
+        return {"failed": f"{type(error).__name__}: {error}"}
 
 
 def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[str, Any]:
@@ -136,13 +150,14 @@ def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[
     ended = calibrate(cell_file, cell, settings, operator, tools, journal, lock_folder=folder)
     assert ended.session is not None
     calibration = calibration_of_session(ended.session)
-    assert calibration is not None
+    if calibration is None:
+        return {"failed": f"no calibration: {ended.session.state.problem}"}
     state = guided(ended.session)
     mounted = [block.payload for block in state.blocks]
     truth = plant.truth(cell)
     errors = {gain.axis: 100.0 * (gain.value / truth[gain.axis] - 1.0) for gain in calibration.gains}
     return {
-        "motion_s": BLOCK_S * len(state.blocks),
+        "motion_s": motion_s(state.blocks, BLOCK_S),
         "changes": changes(mounted),
         "blocks": len(state.blocks),
         "missing": state.missing,
@@ -157,7 +172,10 @@ def step_by_step(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dic
     """The shortest plan whose three runs give every gain within TRUE_ERROR_PERCENT of the truth."""
     worst: dict[str, float] = {}
     for duration_s in DURATIONS_S:
-        error = _worst_error(plant, cell_file, cell, folder / f"steps-{duration_s:g}", duration_s)
+        try:
+            error = _worst_error(plant, cell_file, cell, folder / f"steps-{duration_s:g}", duration_s)
+        except PlanTooShort:  # a person would take the next duration
+            error = float("inf")
         worst[f"{duration_s:g}"] = error
         if error <= TRUE_ERROR_PERCENT:
             return {"duration_s": duration_s, "worst_error_percent": worst}
@@ -208,53 +226,6 @@ def changes(mounted: Sequence[str | None]) -> int:
     return sum(one != other for one, other in zip(before, mounted, strict=True))
 
 
-def session_s(way: dict[str, Any]) -> float:
-    """Motion of a guided session with its changes [s]."""
-    return float(way["motion_s"] + CHANGE_S * way["changes"])
-
-
-def steps_s(way: dict[str, Any]) -> float:
-    """Motion of the three runs with their one change [s]; infinite where no duration was enough."""
-    duration_s = way["duration_s"]
-    return float("inf") if duration_s is None else 3.0 * float(duration_s) + CHANGE_S
-
-
-def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """A line for each robot, and the z of all gains."""
-    lines = [
-        "| robot | seeds | guided: motion s | changes | step by step: duration s | ratio of times, median | "
-        "target missed | error / σ, rms | worst error % |",
-        "|" + "---|" * 9,
-    ]
-    names = dict.fromkeys(row["robot"] for row in rows)
-    lines += [_line(name, [row for row in rows if row["robot"] == name]) for name in names]
-    if rows:
-        ratios = [session_s(row["guided"]) / steps_s(row["step_by_step"]) for row in rows]
-        lines.append(f"| all | {len(rows)} | | | | {np.median(ratios):.2f} | | {_rms_z(rows):.2f} | |")
-    return "\n".join(lines)
-
-
-def _line(name: str, own: Sequence[dict[str, Any]]) -> str:
-    guided_ways = [row["guided"] for row in own]
-    ratios = [session_s(row["guided"]) / steps_s(row["step_by_step"]) for row in own]
-    motion = np.median([way["motion_s"] for way in guided_ways])
-    changed = np.median([way["changes"] for way in guided_ways])
-    durations = [row["step_by_step"]["duration_s"] or np.inf for row in own]
-    missed = sum(bool(way["missing"]) for way in guided_ways)
-    worst = max(abs(error) for way in guided_ways for error in way["error_percent"].values())
-    times = f"{motion:.0f} | {changed:.0f} | {np.median(durations):.0f} | {np.median(ratios):.2f}"
-    return f"| {name} | {len(own)} | {times} | {missed} | {_rms_z(own):.2f} | {worst:.2f} |"
-
-
-def _rms_z(rows: Sequence[dict[str, Any]]) -> float:
-    z = [
-        error / row["guided"]["std_percent"][axis]
-        for row in rows
-        for axis, error in row["guided"]["error_percent"].items()
-    ]
-    return float(np.sqrt(np.mean(np.square(z))))
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Make what is missing, and print the table of what is there."""
     names = [robot.name for robot in ROBOTS]
@@ -264,30 +235,36 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on")
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--tables", type=Path, help="folder of the tables of docs/evidence/session.md, to write them")
     options = parser.parse_args(arguments)
     source = digest_of_source("tests.studies.session_study")
     units = [(robot, seed) for seed in options.seeds for robot in ROBOTS if robot.name in options.only]
 
-    def made(robot: StudiedRobot, seed: int) -> dict[str, Any]:
+    def fingerprint(robot: StudiedRobot, seed: int) -> str:
+        return digest(source, robot.fingerprint, seed)
+
+    def done(unit: tuple[StudiedRobot, int]) -> str:
+        robot, seed = unit
+
         def make(folder: Path) -> dict[str, Any]:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 return study(robot, seed, folder)
 
-        return made_once(options.out, f"{robot.name}-{seed}", digest(source, robot.fingerprint, seed), make)
-
-    rows: list[dict[str, Any]] = []
-
-    def done(unit: tuple[StudiedRobot, int]) -> str:
-        row = made(*unit)
-        rows.append(row)
+        row = made_once(options.out, f"{robot.name}-{seed}", fingerprint(robot, seed), make)
         way = row["guided"]
-        return (
-            f"{row['robot']}-{row['seed']}: guided {way['motion_s']:.0f} s and {way['changes']} changes, "
-            f"step by step {row['step_by_step']['duration_s']}"
-        )
+        found = way.get("failed") or f"{way['motion_s']:.0f} s and {way['changes']} changes"
+        steps = row["step_by_step"]
+        return f"{robot.name}-{seed}: guided {found}, step by step {steps.get('failed') or steps['duration_s']}"
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
+    rows: list[dict[str, Any]] = []
+    for robot, seed in units:
+        path = options.out / f"{robot.name}-{seed}.json"
+        if is_finished(path, fingerprint(robot, seed)):
+            rows.append(json.loads(path.read_text(encoding="utf-8")))
     print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
+    if options.tables is not None:
+        write_tables(options.tables, rows)
     return 0
 
 
