@@ -446,7 +446,9 @@ def _beside_alike(
     )
 
 
-def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
+def drift_diagnosis(
+    drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str], *, is_given: bool = False
+) -> Diagnosis:
     """Diagnosis of a geometry that has changed since a calibration.
 
     Args:
@@ -454,6 +456,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
         model: as declared.
         axes: names of its axes.
         runs: name of the run.
+        is_given: a description that was given changes this number of the log's own one.
     """
     placed = drift.placed
     name = axes[placed.axis]
@@ -472,6 +475,11 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
             expected = "the mounting of the calibration"
             remedy = "level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew"
     found += f"; it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+    if is_given:
+        remedy = (
+            "the given cell file has another number here than the description in the log: correct the cell file, or "
+            f"if it is right, {remedy}"
+        )
     return _diagnosis_of(placed, name, runs, found, expected, remedy)
 
 

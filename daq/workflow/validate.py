@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell, model_of
-from daq.config.same_cell import mismatch_of_calibration
+from daq.config.same_cell import GRAVITY as GRAVITY_SECTION
+from daq.config.same_cell import differing_zeros, mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.diagnoses import DIAGNOSED_AS, drift_diagnosis, with_verbs
@@ -516,9 +517,10 @@ def diagnose_run(
     carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(carried, model.drive_train, conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
-    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
+    suspected = replaced_geometry(run, axes)
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use, suspected)
     if moved is not None:
-        return (drift_diagnosis(moved, model, axes, runs),)
+        return (drift_diagnosis(moved, model, axes, runs, is_given=moved.placed in suspected),)
     size = _rms(validation.measured_nm, use)
     left = _rms(left_nm, use)
     idle = idle_joints(model, size, left)
@@ -540,6 +542,20 @@ def diagnose_run(
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
+
+
+def replaced_geometry(run: Run, axes: Sequence[str]) -> tuple[PlacedEffect, ...]:
+    """Return the corrections of zeros and gravity that a given description makes in that of a log.
+
+    Args:
+        run: as it was read.
+        axes: their names.
+    """
+    sections = () if run.recording is None else run.recording.corrected
+    replaced = [PlacedEffect(ZeroOffset(), axes.index(name)) for name in differing_zeros(sections)]
+    if GRAVITY_SECTION in sections:
+        replaced.append(PlacedEffect(GravityDirection(), 0))
+    return tuple(replaced)
 
 
 def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:

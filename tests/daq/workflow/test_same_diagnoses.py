@@ -30,7 +30,7 @@ from daq.workflow.diagnoses import hidden_zeros_text
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate
 from daq.writeback.gates.fit import uncorrected_description
-from ident.data.run import Run
+from ident.data.run import Recording, Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.joining import SetAside
@@ -65,6 +65,7 @@ conditioning:
   {position_cutoff_hz: 40.0, position_order: 4, decimation_cutoff_hz: 20.0, standstill_rad_s: [0.03, 0.03, 0.03]}
 """
 
+SECTION = "axes.zero_offset (J2)"  #: That a given description changes
 RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
 FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
 FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
@@ -293,6 +294,27 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     console.print(*validation_view(calibration, cross_validate({"one": calibration}, paths[USED:])))
     said_of_fit = "The fit of this calibration found: CHECK J2" in screen.getvalue()
     assert said_of_fit == bool(degrees)
+
+
+def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It explains a small part of what a run without load leaves, and was not named."""
+    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    calibration = calibration_of(fit([Path(f"r{number}") for number in range(USED)]), WHEN)
+    given = Recording(None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,))
+    noise_a = 0.06 * np.random.default_rng(1).standard_normal(recorded[6].current_a.shape)
+    moved = replace(offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given)
+    other = replace(cell, digest="other")
+    found: dict[str, set[str]] = {}
+    for name, run in {"given": moved, "recorded": replace(moved, recording=None)}.items():
+        monkeypatch.setattr(validate_module, "load_run", lambda *_, run=run: (run, other))
+        diagnoses = cross_validate({"one": calibration}, [Path("r6")], other).diagnoses
+        found[name] = said(diagnoses)
+        if name == "given":
+            assert "the given cell file has another number here" in diagnoses[0].remedy
+    assert found == {"given": {"zero-off r6 J2"}, "recorded": set()}
 
 
 def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
