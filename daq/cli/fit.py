@@ -38,6 +38,7 @@ from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from daq.log.reader import LossyLogs
     from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
@@ -311,7 +312,7 @@ def residual_verb(request: ResidualRequest) -> None:
         raise
     show(request.out, request.report, request.pictures)
     if not request.json:
-        _say_after_search(request, calibration)
+        _say_after_search(request, calibration, closed.cell)
 
 
 def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
@@ -335,10 +336,16 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
     return replace(found, accept_worse_holdout=request.accept_worse_holdout)
 
 
-def _say_after_search(request: ResidualRequest, calibration: Calibration) -> None:
-    """Print the next step: what would be written to the controller, or the same search with a calibration to write."""
-    if request.out is not None:
-        say_after_calibration(calibration, request.out, request.logs, request.cell)
+def _say_after_search(request: ResidualRequest, calibration: Calibration, described: Cell) -> None:
+    """Print the next step: what would be written to the controller, or the same search with a calibration to write.
+
+    Args:
+        request: what the search was asked for.
+        calibration: that it has found.
+        described: the cell as its logs describe it.
+    """
+    named = say_after_calibration(calibration, request.out, request.logs, request.cell, described=described)
+    if named or request.out is not None:
         return
     same = request.options()
     if request.seed:
