@@ -286,11 +286,13 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.report.residual_document import residual_report
     from daq.report.residual_page import save_report
     from daq.workflow.fit import calibration_of, check_holdout
+    from daq.workflow.verdicts import needed_verdicts
     from ident.discovery.before_after import account
 
     request.check_places(request.report)
     with status("identifying") as report_step:
         closed = _search(request, report_step)
+        closed = replace(closed, uncertain=needed_verdicts(closed))
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=request.leave_out_runs, progress=report_step)
