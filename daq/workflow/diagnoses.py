@@ -80,6 +80,7 @@ from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
+from ident.model.suggested_gravity import suggested_gravity
 from ident.model.urdf import read_urdf
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
@@ -542,7 +543,8 @@ def _correction_diagnosis(
             )
         case _:
             declared = model.robot.gravity_m_s2
-            turned = vector_text(turned_gravity(declared, values.tolist()))
+            found_m_s2 = turned_gravity(declared, values.tolist())
+            turned = vector_text(suggested_gravity(found_m_s2, float(np.max(deviations))))
             found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
             expected = f"{vector_text(declared)}, as the cell file says"
             remedy = (

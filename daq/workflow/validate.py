@@ -377,7 +377,8 @@ def cross_validate(
             standard = _standard_system(first_own, model, run, conditioning)
             condition = _condition(calibrations[first], standard)
         if standard is not None and first in found and not found[first].is_judged:
-            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning)
+            suspected = replaced_geometry(first_own, run, described)
+            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning, suspected)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
@@ -447,7 +448,8 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     conditioning = conditioning_of(calibration)
     with suppress(IdentificationError):
         standard = _standard_system(calibration, model, run, conditioning)
-        return diagnose_run(calibration, validation, model, run, standard, conditioning)
+        suspected = replaced_geometry(calibration, run, described)
+        return diagnose_run(calibration, validation, model, run, standard, conditioning, suspected)
     return ()
 
 
@@ -495,6 +497,7 @@ def diagnose_run(
     run: Run,
     standard: System,
     conditioning: Conditioning,
+    suspected: Sequence[PlacedEffect] = (),
 ) -> tuple[Diagnosis, ...]:
     """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
 
@@ -505,6 +508,7 @@ def diagnose_run(
         run: as it was read.
         standard: equations of this run alone, in standard parameters (`reduce_runs`).
         conditioning: the filters.
+        suspected: of `replaced_geometry`.
 
     Raises:
         CurrentConstant: a motor moves, and its current has one value.
@@ -517,7 +521,6 @@ def diagnose_run(
     carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(carried, model.drive_train, conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
-    suspected = replaced_geometry(run, axes)
     moved = geometry_drift(calibration, model, data, conditioning, left_nm, use, suspected)
     if moved is not None:
         return (drift_diagnosis(moved, model, axes, runs, is_given=moved.placed in suspected),)
@@ -544,14 +547,20 @@ def diagnose_run(
     return tuple(found or errors)
 
 
-def replaced_geometry(run: Run, axes: Sequence[str]) -> tuple[PlacedEffect, ...]:
+def replaced_geometry(calibration: Calibration, run: Run, described: Cell) -> tuple[PlacedEffect, ...]:
     """Return the corrections of zeros and gravity that a given description makes in that of a log.
 
+    There are none where the calibration was made with the given description: it predicts in the same geometry.
+
     Args:
+        calibration: that predicts.
         run: as it was read.
-        axes: their names.
+        described: the given description.
     """
-    sections = () if run.recording is None else run.recording.corrected
+    if run.recording is None or described.recording_digest == calibration.recording_configuration_sha256:
+        return ()
+    sections = run.recording.corrected
+    axes = described.axis_names
     replaced = [PlacedEffect(ZeroOffset(), axes.index(name)) for name in differing_zeros(sections)]
     if GRAVITY_SECTION in sections:
         replaced.append(PlacedEffect(GravityDirection(), 0))

@@ -47,6 +47,7 @@ from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
 from ident.model.robot import JointKind, Motion
+from ident.model.suggested_gravity import suggested_gravity
 
 GRAVITY_TURNED = "gravity-turned"
 POSITION_REVERSED = "position-reversed"
@@ -167,8 +168,9 @@ class TurnedGeometry:
         others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
+            suggested_m_s2 = suggested_gravity(found.found_m_s2, float(np.deg2rad(found.std_deg)))
             remedy = (
-                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
+                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(suggested_m_s2)} m/s² by "
                 f"these recordings; {UNTIL_RIGHT}"
             )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)

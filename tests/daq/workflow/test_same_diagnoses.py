@@ -28,7 +28,7 @@ from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
 from daq.workflow.diagnoses import hidden_zeros_text
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
-from daq.workflow.validate import cross_validate
+from daq.workflow.validate import cross_validate, replaced_geometry
 from daq.writeback.gates.fit import uncorrected_description
 from ident.data.run import Recording, Run
 from ident.discovery.effect_verdict import Judgement
@@ -306,7 +306,7 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
     given = Recording(None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,))
     noise_a = 0.06 * np.random.default_rng(1).standard_normal(recorded[6].current_a.shape)
     moved = replace(offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given)
-    other = replace(cell, digest="other")
+    other = replace(cell, digest="other", recording_digest="other")
     found: dict[str, set[str]] = {}
     for name, run in {"given": moved, "recorded": replace(moved, recording=None)}.items():
         monkeypatch.setattr(validate_module, "load_run", lambda *_, run=run: (run, other))
@@ -315,6 +315,9 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
         if name == "given":
             assert "the given cell file has another number here" in diagnoses[0].remedy
     assert found == {"given": {"zero-off r6 J2"}, "recorded": set()}
+    # A calibration of the same description predicts in the same geometry.
+    made_with_it = replace(calibration, recording_configuration_sha256=other.recording_digest)
+    assert replaced_geometry(made_with_it, moved, other) == ()
 
 
 def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
