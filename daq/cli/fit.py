@@ -147,6 +147,7 @@ def fit_verb(request: FitRequest) -> None:
 
     from daq.report.fit import fit_report, fit_view
     from daq.workflow.cases import calibration_of_case
+    from daq.workflow.diagnoses import geometry_refusal
     from daq.workflow.fit import compare_estimators
 
     if request.cases is not None:
@@ -156,6 +157,11 @@ def fit_verb(request: FitRequest) -> None:
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
+    refused = geometry_refusal(calibration.diagnoses)
+    if refused is not None:  # nothing is written, and no gains are shown that mean nothing
+        if request.json:
+            print_json(fit_report(found, calibration, None))
+        raise refused
     _save(found.fitted, calibration, request.out, request.pictures)
     if request.report is not None:
         _save_certificate(found.fitted, calibration, request.report)
@@ -285,6 +291,7 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.report.residual import residual_view
     from daq.report.residual_document import residual_report
     from daq.report.residual_page import save_report
+    from daq.workflow.diagnoses import geometry_refusal
     from daq.workflow.fit import calibration_of, check_holdout
     from daq.workflow.verdicts import needed_verdicts
     from ident.discovery.before_after import account
@@ -308,6 +315,10 @@ def residual_verb(request: ResidualRequest) -> None:
             with status("drawing the report"), replace_output(request.report):
                 save_report(closed, changed, calibration, request.report)
         check_holdout(closed)
+        refused = geometry_refusal(calibration.diagnoses)
+        if refused is not None:
+            show(request.report)  # what was found may say why
+            raise refused
         _save(closed, calibration, request.out, request.pictures)
     except OutputFailed:
         show()  # what took minutes to find is not lost with the disk

@@ -76,7 +76,7 @@ from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
-from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
@@ -176,14 +176,33 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
     except (EffectImpossible, ModelContradicted, NotConverged, PayloadUnseen):
         turned = turned_geometry(recordings, (), None)
         if turned is not None:
-            raise GeometryTurned(
-                ", ".join(turned.axes) or "the mounting",
-                found=turned.found,
-                expected=turned.expected,
-                remedy=turned.remedy,
-            ) from None
+            raise _as_error(turned) from None
         require_right_currents(recordings)
         raise
+
+
+def geometry_refusal(diagnoses: Sequence[Diagnosis]) -> GeometryTurned | None:
+    """Return the error for gains that mean nothing, because their fit is one in a wrong geometry; None for others.
+
+    What is said of a held-out run alone leaves the gains of the others as they are.
+
+    Args:
+        diagnoses: of a fit and of its held-out runs.
+    """
+    for one in diagnoses:
+        if one.name in GEOMETRY and not one.runs:
+            return _as_error(one)
+    return None
+
+
+def _as_error(turned: Diagnosis) -> GeometryTurned:
+    """Return the error that says the same as a diagnosis of the geometry."""
+    return GeometryTurned(
+        ", ".join(turned.axes) or "the mounting",
+        found=turned.found,
+        expected=turned.expected,
+        remedy=turned.remedy,
+    )
 
 
 def turned_geometry(
