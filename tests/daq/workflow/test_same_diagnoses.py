@@ -26,9 +26,10 @@ from daq.report.certificate import certify
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import without_controller
 from daq.report.validation import validation_view
+from daq.workflow import diagnoses as diagnoses_module
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.diagnoses import geometry_refusal, hidden_zeros_text
+from daq.workflow.diagnoses import geometry_beside, geometry_refusal, hidden_zeros_text
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate, replaced_geometry
 from daq.writeback.gates.fit import uncorrected_description
@@ -41,12 +42,13 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import LatePosition, ZeroOffset
 from ident.errors import Diagnosis, IdentificationError
-from ident.estimators.turned_geometry import with_gravity
+from ident.estimators.turned_geometry import find_turned_geometry, with_gravity
 from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
 from tests.ident.findings import passed_finding
 from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, record, three_axes_truth
+from tests.remembered import remembered
 
 WHEN = datetime(2025, 1, 2, tzinfo=UTC)
 CELL = """\
@@ -226,6 +228,11 @@ def said(diagnoses: tuple[Diagnosis, ...]) -> set[str]:
     return {" ".join((one.name, *one.runs, *one.axes)) for one in diagnoses}
 
 
+def refuse_to_weigh() -> None:
+    """Weigh no payload."""
+    raise IdentificationError("no mass is asked for")
+
+
 def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
     return sorted(one.text for one in diagnoses)
 
@@ -243,6 +250,13 @@ def test_the_same_is_said_by_every_verb(
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", load)
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    # Every verb asks for these itself; what is asked with the same arguments again is not computed again.
+    turned_geometry = remembered(find_turned_geometry)
+    for asking in (diagnoses_module, validate_module):
+        monkeypatch.setattr(asking, "find_turned_geometry", turned_geometry)
+    monkeypatch.setattr(fit_module, "geometry_beside", remembered(geometry_beside))
+    # The masses of a validation say nothing of a diagnosis.
+    monkeypatch.setattr(validate_module, "rows_to_weigh", lambda *_, **__: refuse_to_weigh())
     paths = [Path(f"r{number}") for number in range(RUNS)]
     logs, holdout = paths[:USED], paths[USED:]
     verbs: dict[str, Callable[[], tuple[Diagnosis, ...]]] = {
