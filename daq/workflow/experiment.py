@@ -16,10 +16,12 @@ from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import decimator
 from ident.model.robot import JointKind, Motion, Robot, poses
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
+from ident.planning.effort import believable_efforts, effort_shares
 from ident.planning.excitation import (
     Design,
     Excitation,
     Expectation,
+    declared_efforts,
     effective_noise,
     nominal_links,
     nominal_parameters,
@@ -172,6 +174,9 @@ class Experiment:
     payload: WeighedPayload  #: that will be mounted
     row_s: float  #: time between two rows of the observation [s]
     edge_s: float  #: how long after a standstill rows begin to count [s]
+    effort: (
+        FloatArray  #: limit of each axis' torque [Nm; N of a prismatic joint], inf where it is not known, shape (n,)
+    )
     remarks: tuple[str, ...]  #: what was assumed, in words
     mounted: tuple[int | None, ...] = RUNS  #: what is mounted at each repetition of the moves: payload or None
 
@@ -193,6 +198,19 @@ class Experiment:
         excitation, slices = self.excitation(paths, thinning)
         whitened = self.design.whitened(excitation)
         return [thinning * self.design.information_of(whitened[:, :, part], self.mounted) for part in slices]
+
+    def effort_shares(self, paths: Sequence[Trapezoid]) -> FloatArray:
+        """Largest expected torque of each axis on each way, over its limit; shape (ways, n).
+
+        It is that with the heavier of the payloads that are mounted in turn.
+        """
+        if not paths or not np.isfinite(self.effort).any():
+            return np.zeros((len(paths), len(self.effort)))
+        times = [_torque_times(path) for path in paths]
+        motion = _joined([path.at(time) for path, time in zip(paths, times, strict=True)])
+        shares = effort_shares(self.design.expectation, self.effort, motion, self.mounted)
+        of_ways = shares.reshape(len(self.effort), len(paths), -1)
+        return np.asarray(of_ways.max(axis=2).T)
 
     def _use(self, path: Trapezoid, time_s: FloatArray) -> BoolArray:
         """Rows of each motor that count; the same rule as ident/equations/rows.py, for moves from rest to rest."""
@@ -259,7 +277,38 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
     period = filter_.factor / RATE_HZ
     edge = max(filter_.half - inside, 0) / RATE_HZ
-    return Experiment(cell, design, scene, mounted, period, edge, remarks)
+    declared = declared_efforts(model, cell.urdf)
+    effort = believable_efforts(expectation, declared, fast_motion.position_rad, RUNS)
+    remarks = (*remarks, *_effort_remarks(cell, declared, effort))
+    return Experiment(cell, design, scene, mounted, period, edge, effort, remarks)
+
+
+def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray) -> tuple[str, ...]:
+    """Say which axes have no effort limit that moves could be kept below."""
+    lines = []
+    unknown = [name for name, limit in zip(cell.axis_names, declared, strict=True) if np.isinf(limit)]
+    if unknown:
+        lines.append(f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there")
+    is_refuted = np.isfinite(declared) & np.isinf(believed)
+    refuted = [name for name, refutes in zip(cell.axis_names, is_refuted, strict=True) if refutes]
+    if refuted:
+        lines.append(
+            f"torque limits: gravity alone asks more than the `effort` of {', '.join(refuted)} in the URDF; not kept "
+            "there. Correct `effort`"
+        )
+    return tuple(lines)
+
+
+PIECE_SHARES = np.array([0.01, 0.25, 0.5, 0.75, 0.99])
+"""Where the torque is looked at in each piece of a trapezoid: near its ends, where it jumps, and between."""
+
+
+def _torque_times(path: Trapezoid) -> FloatArray:
+    """Times at which the torque of a move may be largest [s], also at rest before and after it; as many for each."""
+    corners = (0.0, path.ramp_s, path.duration_s - path.ramp_s, path.duration_s)
+    pieces = [begin + PIECE_SHARES * (end - begin) for begin, end in pairwise(corners)]
+    at_rest = np.array([-1.0, path.duration_s + 1.0])
+    return np.concatenate([*pieces, at_rest])
 
 
 NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows what closures allow

@@ -42,6 +42,7 @@ from drivers.move import Trapezoid
 from ident.arrays import FloatArray
 from ident.model.robot import Robot
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
+from ident.planning.effort import EFFORT_MARGIN
 from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
 from ident.plausible import format_at_limit
@@ -76,6 +77,7 @@ WISHED_MOVES = 30  #: With so many, σ is judged by leaving moves out, and the s
 MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
 MAX_RETREATS = 30
 MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
+SLOWER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2)  #: Shares of its speed at which a move is tried that asks too much torque
 PLACES = 3  #: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
 
 
@@ -289,6 +291,9 @@ class Search:
             if all(obstruction(path.start, path.end) is None for way, path in new.items() if way not in fresh):
                 kept.append((moves, ways))
                 fresh |= new
+        is_carried = self._is_carried(list(fresh.values()))
+        fresh = {way: path for (way, path), fits in zip(fresh.items(), is_carried, strict=True) if fits}
+        kept = [(moves, ways) for moves, ways in kept if all(way in known or way in fresh for way in ways)]
         informations = self._experiment.informations(list(fresh.values()), THINNING)
         known |= {
             way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
@@ -321,8 +326,23 @@ class Search:
             if np.array_equal(target, start) or not self._is_within(move):
                 continue
             if checker.obstruction(start, np.array(move.target_rad)) is None:
-                return move
+                carried = self._slow_enough(start, move)
+                if carried is not None:
+                    return carried
         return None
+
+    def _slow_enough(self, start: FloatArray, move: PlannedMove) -> PlannedMove | None:
+        """The move as fast as the drives can carry it; None where they cannot even slowly."""
+        for share in SLOWER:
+            slower = _slower(move, share)
+            if self._is_carried([path_of(self._cell, start, slower)])[0]:
+                return slower
+        return None
+
+    def _is_carried(self, paths: Sequence[Trapezoid]) -> list[bool]:
+        """Whether the drives can give the torque of each way, with a margin for what is not known of it."""
+        shares = self._experiment.effort_shares(paths)
+        return [bool(fits) for fits in np.all(EFFORT_MARGIN * shares <= 1.0, axis=1)]
 
     def _random_move(self) -> PlannedMove:
         # Slow and fast moves both: friction is distinguished from inertia by moves of different speed and acceleration.
@@ -356,6 +376,12 @@ class Search:
             if obstruction is not None:
                 blocking.append(obstruction)
         if not blocking:
+            too_weak = self._too_weak()
+            if too_weak:
+                found += f": also slowly, they ask too much torque of {', '.join(too_weak)}"
+                expected = f"at most the `effort` of the URDF over {EFFORT_MARGIN:g}"
+                remedy = "correct `effort` in the URDF, declare a lighter payload, or narrow the joint limits"
+                return _unfit(self._cell, self._duration_s, found, expected, remedy)
             return _unfit(self._cell, self._duration_s, found, "room to move in", "widen the joint limits")
         pairs = Counter((one.first, one.second) for one in blocking)
         (worst, times), *_ = pairs.most_common(1)
@@ -366,6 +392,14 @@ class Search:
         found += f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most {1000.0 * farthest_m:.0f} mm apart"
         expected = f"at least {1000.0 * checker.scene.minimum_m:.0f} mm"
         return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
+
+    def _too_weak(self) -> list[str]:
+        """Names of the axes whose drives cannot carry most of some slow random ways."""
+        moves = [_slower(self._random_move(), SLOWER[-1]) for _ in range(MAX_TRIES)]
+        paths = [path_of(self._cell, np.array(one.target_rad), two) for one, two in pairwise(moves)]
+        is_heavy = EFFORT_MARGIN * self._experiment.effort_shares(paths) > 1.0
+        often = np.mean(is_heavy, axis=0) > 0.5
+        return [name for name, is_weak in zip(self._cell.axis_names, often, strict=True) if is_weak]
 
 
 def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
@@ -431,7 +465,8 @@ def plan(
 
     Random moves fill the duration; then they are exchanged, shifted, stretched and sped up one at a time, and what
     lowers the predicted standard deviation of the worst gain stays. All moves keep position, velocity and acceleration
-    limits, the workspace and clear of the arm itself, on their whole way.
+    limits, the workspace and clear of the arm itself, on their whole way, and the torque limits of the URDF with a
+    margin.
 
     Args:
         cell: with robot, limits and a weighed payload.
@@ -559,6 +594,13 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
         for move in plan_.moves
     )
     return replace(plan_, duration_s=experiment_duration_s(cell, moves), moves=moves)
+
+
+def _slower(move: PlannedMove, share: float) -> PlannedMove:
+    """The same way at a share of its speed, as the plan file will say it."""
+    velocity = round(move.velocity * share, PLACES)
+    acceleration = round(move.acceleration * share**2, PLACES)
+    return replace(move, velocity=velocity, acceleration=acceleration)
 
 
 # The file of a plan: moves that a person can read, change and approve before anything moves

@@ -42,6 +42,7 @@ VISCOUS_FRICTION = 0.10
 ROTOR = 0.03
 """Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit;
 typical of geared arms (paper, Table 3)."""
+LARGEST_EFFORT = 1e6  #: [Nm or N]; some exporters write 0, others 1e9 for an effort that is not known
 TORQUE_RESERVE = 3.0  #: Torque limit over the largest rigid-body torque, where the URDF gives none
 
 
@@ -348,6 +349,13 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     return ExpectedPayload(frozenset(payload.known), parameters)
 
 
+def declared_efforts(model: Model, urdf: str) -> FloatArray:
+    """Return the effort limit of each axis in the URDF [Nm or N], shape (n,); inf where it is not known."""
+    declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
+    is_known = (declared > 0.0) & (declared < LARGEST_EFFORT)
+    return np.where(is_known, declared, np.inf)
+
+
 def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motion: Motion) -> FloatArray:
     """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque, shape (n,).
 
@@ -359,9 +367,8 @@ def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motio
     columns = model.regressor(fast_motion)
     rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
     largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
-    declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
-    usable = (declared > 0.0) & (declared < 1e6)  # some exporters write 0, others 1e9 for "not known"
-    return np.where(usable, declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
+    declared = declared_efforts(model, urdf)
+    return np.where(np.isfinite(declared), declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
 
 
 def nominal_parameters(
