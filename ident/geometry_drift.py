@@ -8,7 +8,7 @@ motion and a constant. So is what another payload, or another way of mounting it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +39,7 @@ class GeometryDrift:
     values: FloatArray  #: of its coefficients, shape (p,)
     deviations: FloatArray  #: their σ by the scatter of moves, shape (p,)
     share: float  #: of the squared error that it explains, beyond what the fit leaves and friction and gains explain
+    explained: float  #: squared error that it explains, each axis weighted by its own error
 
 
 def geometry_drift(
@@ -48,8 +49,11 @@ def geometry_drift(
     conditioning: Conditioning,
     left_nm: FloatArray,
     use: BoolArray,
+    suspected: Collection[PlacedEffect] = (),
 ) -> GeometryDrift | None:
     """Name the change of the geometry that explains the error of a prediction; None where none does.
+
+    Of several, it is the one that explains most.
 
     Args:
         calibration: that predicts.
@@ -58,6 +62,8 @@ def geometry_drift(
         conditioning: the filters of the rows.
         left_nm: measured less predicted torque at the rows [Nm or N], shape (m, r).
         use: rows of each axis that count, shape (m, r).
+        suspected: corrections of numbers that are known to differ from those of the run's own description. They need
+            not explain most of the error: they are few, and named beforehand.
     """
     if model.is_redundant:
         return None  # internal preload hides a part of the torque
@@ -81,13 +87,15 @@ def geometry_drift(
     usual_nm = _usual_error_nm(calibration, torque_nm, use)
     usual = float(np.sum((usual_nm[:, None] * weight) ** 2))
     excess = float(np.sum(left**2)) - usual
-    if not excess > 0.0:
-        return None  # it is predicted as well as what was fitted
     best: GeometryDrift | None = None
     for placed in _candidates(model):
+        is_suspected = placed in suspected
+        if not is_suspected and not excess > 0.0:
+            continue  # the run is predicted as well as what was fitted
         columns = _beyond(nuisance, placed.effect.columns(signals, placed.axis), weight)
-        found = _fitted(placed, columns, left, move, excess)
-        if found is not None and (best is None or found.share > best.share):
+        least = 0.0 if is_suspected else max(LEAST_SHARE * excess, SMALLEST_SHARE * float(np.sum(left**2)))
+        found = _fitted(placed, columns, left, move, excess, least)
+        if found is not None and (best is None or found.explained > best.explained):
             best = found
     return best
 
@@ -134,7 +142,7 @@ def _usual_error_nm(calibration: Calibration, torque_nm: FloatArray, use: BoolAr
 
 
 def _fitted(
-    placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray, excess: float
+    placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray, excess: float, least: float
 ) -> GeometryDrift | None:
     """Least squares of one correction, with σ by moves; None where it is not certain enough.
 
@@ -144,6 +152,7 @@ def _fitted(
         left: the weighted error, shape (m, r).
         move: number of each row's move, shape (r,).
         excess: squared error beyond that of the fit.
+        least: squared error that it must explain.
     """
     gram = np.einsum("mpr,mqr->pq", columns, columns)
     score = np.einsum("mpr,mr->pr", columns, left)
@@ -162,13 +171,13 @@ def _fitted(
     wald = float(values @ np.linalg.pinv(covariance) @ values)
     whole = float(np.sum(left**2))
     explained = whole - float(np.sum(rest**2))
-    if explained < LEAST_SHARE * excess or explained < SMALLEST_SHARE * whole or wald < CERTAIN_SIGMAS**2:
+    if explained < least or wald < CERTAIN_SIGMAS**2:
         return None
     bounds = zip(values, placed.effect.coefficients, strict=True)
     if any(not column.least <= value <= column.largest for value, column in bounds):
         return None
     share = min(1.0, explained / max(excess, explained))
-    return GeometryDrift(placed, values, np.sqrt(np.diag(covariance)), share)
+    return GeometryDrift(placed, values, np.sqrt(np.diag(covariance)), share, explained)
 
 
 def _rms(values: FloatArray) -> float:

@@ -32,12 +32,13 @@ from daq.cli.verb import (
     print_json,
     taking,
 )
-from daq.errors import ExitCode, OutputFailed, UsageError, writing
+from daq.errors import OutputFailed, UsageError, writing
 from daq.files import replace_file
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
 if TYPE_CHECKING:
+    from daq.config.cell import Cell
     from daq.log.reader import LossyLogs
     from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
@@ -146,6 +147,7 @@ def fit_verb(request: FitRequest) -> None:
 
     from daq.report.fit import fit_report, fit_view
     from daq.workflow.cases import calibration_of_case
+    from daq.workflow.diagnoses import geometry_refusal
     from daq.workflow.fit import compare_estimators
 
     if request.cases is not None:
@@ -155,6 +157,11 @@ def fit_verb(request: FitRequest) -> None:
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
+    refused = geometry_refusal(calibration.diagnoses)
+    if refused is not None:  # nothing is written, and no gains are shown that mean nothing
+        if request.json:
+            print_json(fit_report(found, calibration, None))
+        raise refused
     _save(found.fitted, calibration, request.out, request.pictures)
     if request.report is not None:
         _save_certificate(found.fitted, calibration, request.report)
@@ -164,11 +171,9 @@ def fit_verb(request: FitRequest) -> None:
             comparison = compare_estimators(found.fitted, report_step)
     if request.json:
         print_json(fit_report(found, calibration, comparison))
-        end_if_turned(calibration)
         return
     print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
     say_after_fit(calibration, [*request.logs, *request.options()], request.out)
-    end_if_turned(calibration)
 
 
 def _fit(request: FitRequest) -> CaseFit:
@@ -286,12 +291,15 @@ def residual_verb(request: ResidualRequest) -> None:
     from daq.report.residual import residual_view
     from daq.report.residual_document import residual_report
     from daq.report.residual_page import save_report
+    from daq.workflow.diagnoses import geometry_refusal
     from daq.workflow.fit import calibration_of, check_holdout
+    from daq.workflow.verdicts import needed_verdicts
     from ident.discovery.before_after import account
 
     request.check_places(request.report)
     with status("identifying") as report_step:
         closed = _search(request, report_step)
+        closed = replace(closed, uncertain=needed_verdicts(closed))
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
         changed = account(start_of(closed), closed.steps, leave_out_runs=request.leave_out_runs, progress=report_step)
@@ -307,14 +315,17 @@ def residual_verb(request: ResidualRequest) -> None:
             with status("drawing the report"), replace_output(request.report):
                 save_report(closed, changed, calibration, request.report)
         check_holdout(closed)
+        refused = geometry_refusal(calibration.diagnoses)
+        if refused is not None:
+            show(request.report)  # what was found may say why
+            raise refused
         _save(closed, calibration, request.out, request.pictures)
     except OutputFailed:
         show()  # what took minutes to find is not lost with the disk
         raise
     show(request.out, request.report, request.pictures)
     if not request.json:
-        _say_after_search(request, calibration)
-    end_if_turned(calibration)
+        _say_after_search(request, calibration, closed.cell)
 
 
 def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit:
@@ -338,10 +349,16 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
     return replace(found, accept_worse_holdout=request.accept_worse_holdout)
 
 
-def _say_after_search(request: ResidualRequest, calibration: Calibration) -> None:
-    """Print the next step: what would be written to the controller, or the same search with a calibration to write."""
-    if request.out is not None:
-        say_after_calibration(calibration, request.out, request.logs, request.cell)
+def _say_after_search(request: ResidualRequest, calibration: Calibration, described: Cell) -> None:
+    """Print the next step: what would be written to the controller, or the same search with a calibration to write.
+
+    Args:
+        request: what the search was asked for.
+        calibration: that it has found.
+        described: the cell as its logs describe it.
+    """
+    named = say_after_calibration(calibration, request.out, request.logs, request.cell, described=described)
+    if named or request.out is not None:
         return
     same = request.options()
     if request.seed:
@@ -380,14 +397,6 @@ def check_report(folder: Path | None, out: Path | None = None) -> None:
             pass
     for name, mark in MARKS.items():
         check_replaceable(folder / name, mark, "report of `drivegain residual`")
-
-
-def end_if_turned(calibration: Calibration) -> None:
-    """End with the exit code of a fit that is refused, where it names a geometry in which no number means anything."""
-    from daq.report.fit import names_turned_geometry
-
-    if names_turned_geometry(calibration.diagnoses):
-        raise typer.Exit(ExitCode.DATA_UNFIT)
 
 
 def _save_certificate(fitted: Fit, calibration: Calibration, folder: Path) -> None:

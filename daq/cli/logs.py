@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +19,7 @@ from daq.cli.terminal import (
     replace_output,
     say,
     status,
+    write_output,
 )
 from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
 from daq.environment import require_packages, software
@@ -37,8 +39,18 @@ if TYPE_CHECKING:
 NewLogOption = Annotated[Path, output_option("--out", "Log to write (.mcap); must not exist.")]
 
 
-def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
-    """Show what is in a log: role and payload, duration, losses, moves, validity."""
+def info(
+    log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
+    extract_cell: Annotated[
+        Path | None,
+        output_option("--extract-cell", "New folder for the cell description in the log: cell file, URDF, drives."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Show what is in a log: role and payload, duration, losses, moves, validity.
+
+    With --extract-cell also write the description of the cell as files that every verb takes as --cell.
+    """
     from daq.report.document import json_tree
     from daq.report.log import info_report, log_lines
 
@@ -50,10 +62,50 @@ def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: Json
             error.found = "a calibration"
             error.remedy = f"`drivegain certificate {log}` reads it"
         raise
+    written = None if extract_cell is None else _extract_cell(log, extract_cell)
     if json:
         print_json(report)
     else:
-        print_view(log_lines(json_tree(report), output_console().width))
+        print_view(log_lines(json_tree(report), output_console().width), written)
+
+
+def _extract_cell(log: Path, folder: Path) -> Path:
+    """Write the cell description of a log into a new or empty folder, all files or none; return the cell file.
+
+    Raises:
+        UsageError: the folder has something in it.
+        OutputFailed: what was written is not read as the cell of the log.
+    """
+    from daq.config.cell_file import load_cell
+    from daq.config.extracted_cell import extracted_cell
+    from daq.config.same_cell import differing_sections
+    from daq.log.reader import read_log
+
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(
+            str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
+        )
+    head = read_log(log).head
+    place, files = extracted_cell(head.files)
+    with write_output(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+            whole = Path(temporary) / "cell"
+            for path, content in files.items():
+                target = whole / path
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(content)
+            differing = differing_sections(head.cell(log), load_cell(whole / place))
+            if differing:
+                raise OutputFailed(
+                    str(folder),
+                    found=f"another {', '.join(differing)} on reading back",
+                    expected="the description in the log",
+                    remedy="nothing was written; please report this log",
+                )
+            whole.chmod(0o755)
+            whole.rename(folder)
+    return folder / place
 
 
 def import_files(

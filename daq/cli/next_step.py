@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,7 @@ from daq.errors import DaqError
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.plan import Plan
+    from daq.writeback.gates.gate import Refusal
     from ident.calibration import Calibration
     from ident.errors import Diagnosis
 
@@ -188,41 +190,96 @@ def say_after_fit(calibration: Calibration, arguments: Sequence[object], written
 
 def say_after_calibration(
     calibration: Calibration,
-    file: Path,
+    file: Path | None,
     logs: Sequence[Path],
     cell: Path | None,
     diagnoses: Sequence[Diagnosis] | None = None,
-) -> None:
-    """Name the dry run that shows what would be written, unless there is something to correct before.
+    described: Cell | None = None,
+) -> bool:
+    """Name the dry run that shows what would be written, unless `apply` would refuse it or a cause must be found first.
 
     Args:
         calibration: that could be written.
-        file: it is in.
+        file: it is in; None where it was not written, and nothing can be applied yet.
         logs: of the command.
         cell: its file; None where the command was given none.
         diagnoses: that the command has printed; those of the calibration when None.
+        described: the cell as the logs describe it, where no file of it is found; None where it is not known.
+
+    Returns:
+        whether a step was named.
     """
+    printed = calibration.diagnoses if diagnoses is None else diagnoses
+    if _say_cause_first(calibration, printed):
+        return True
+    if calibration.gains_fixed:  # every gate of such gains is closed
+        return False
+    place = cell or cell_of(calibration, logs)
+    refusal = first_refusal(calibration, file, place, described)
+    if refusal is not None:
+        reason = f"{refusal.subject}: {refusal.found}"
+        typer.echo(f"Next: {refusal.remedy}. `drivegain apply` refuses this calibration: {reason}.", err=True)
+        return True
+    if file is None:
+        return False
+    say_next("drivegain", "apply", place, file)
+    return True
+
+
+def _say_cause_first(calibration: Calibration, printed: Sequence[Diagnosis]) -> bool:
+    """Print what has to be done about diagnoses before anything is written; return whether there is something."""
     from daq.writeback.gates.fit import OF_DESCRIPTION
-    from daq.writeback.gates.table import check_calibration
 
     if _needs_other_moves(calibration):
         _say_record_more()
-        return
-    printed = calibration.diagnoses if diagnoses is None else diagnoses
+        return True
     if any(one.name in OF_DESCRIPTION for one in printed):
         say_correct_first()
-        return
-    if calibration.gains_fixed:  # every gate of such gains is closed
-        return
-    if printed:
+        return True
+    if printed and not calibration.gains_fixed:
         say_look_first()
-        return
-    refusals = check_calibration(calibration)
-    if refusals:
-        subject, found, _, remedy = refusals[0]
-        typer.echo(f"Next: {remedy}. `drivegain apply` refuses this calibration: {subject}: {found}.", err=True)
-        return
-    say_next("drivegain", "apply", cell or cell_of(calibration, logs), file)
+        return True
+    return False
+
+
+def first_refusal(
+    calibration: Calibration, file: Path | None, place: Path, described: Cell | None = None
+) -> Refusal | None:
+    """Return the first reason for which `drivegain apply` refuses a calibration now; None where it does not.
+
+    Args:
+        calibration: that could be written.
+        file: it is in, beside which signatures are; None where it was not written.
+        place: file of the cell, or CELL where it is not certain.
+        described: the cell as the logs describe it, for a file that cannot be read.
+    """
+    from daq.documents.calibration_file import read_calibration_bytes
+    from daq.report.comparison import without_controller
+    from daq.writeback.file_target import FileTarget
+    from daq.writeback.gates.gate import Gate
+    from daq.writeback.request import Request
+    from daq.writeback.target import propose
+
+    now = datetime.now(UTC)
+    cell = _read_cell(place) or described
+    if cell is not None:
+        with suppress(DaqError):  # a controller that cannot be read refuses nothing yet
+            content = None if file is None else read_calibration_bytes(file)
+            request = Request(calibration, now, file=file, content=content)
+            refusals = propose(FileTarget.of(cell), request).refusals
+            # The dry run prints the --base that opens this one.
+            return next((one for one in refusals if one.gate is not Gate.BASE), None)
+    refusals = without_controller(calibration, "", now, cell).refusals
+    return next(iter(refusals), None)
+
+
+def _read_cell(place: Path) -> Cell | None:
+    """Read a cell file; None where that fails."""
+    from daq.config.cell_file import load_cell
+
+    with suppress(DaqError):
+        return load_cell(place)
+    return None
 
 
 def cell_of(calibration: Calibration, logs: Sequence[Path]) -> Path:

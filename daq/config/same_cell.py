@@ -136,7 +136,7 @@ def _sections(cell: Cell) -> dict[str, object]:
     chain = cell.chain
     return {
         "robot.urdf": cell.urdf,
-        "robot.gravity_m_s2": cell.gravity_m_s2,
+        GRAVITY: cell.gravity_m_s2,
         "closures": None if chain is None else replace(chain, passive_joints=()),  # these follow from the URDF
         "drive_train.ratio": cell.ratio.tolist(),
         "bus": cell.buses,
@@ -160,6 +160,17 @@ def _differing_axes(own: Sequence[CellAxis], given: Sequence[CellAxis]) -> list[
             sections.append(f"axes.{key} ({', '.join(differing)})")
     return sections
 
+
+def differing_zeros(sections: Sequence[str]) -> tuple[str, ...]:
+    """Return the axes of the zeros among sections that differ, as by `differing_sections`."""
+    begin = f"axes.{_KEYS['zero_offset_rad']} ("
+    for section in sections:
+        if section.startswith(begin):
+            return tuple(section.removeprefix(begin).removesuffix(")").split(", "))
+    return ()
+
+
+GRAVITY = "robot.gravity_m_s2"  #: Section of gravity
 
 _KEYS = {"zero_offset_rad": "zero_offset", "profile": "drive profile", "unit": "limits"}
 """Key of the cell file behind a field of `CellAxis` with another name."""

@@ -98,13 +98,17 @@ def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, mos
         most: number of blocks until the recording ends, at least one.
     """
     wanted = (1.0 / so_far.bare + 1.0 / so_far.loaded) / variance_ratio * (1.0 + ROUNDING)
-    in_time: list[BlocksToCome] = []
+    quickest: BlocksToCome | None = None
     for bare in range(most + 1):
+        if quickest is not None and block_s * bare >= _time_s(so_far, quickest, block_s):
+            break  # The bare blocks alone take as long
         way = _with_bare(so_far, bare, wanted)
-        if way is not None and 1 <= way.count <= most:
-            in_time.append(way)
-    if in_time:
-        return min(in_time, key=lambda way: _time_s(so_far, way, block_s))
+        if way is None or not 1 <= way.count <= most:
+            continue
+        if quickest is None or _time_s(so_far, way, block_s) < _time_s(so_far, quickest, block_s):
+            quickest = way
+    if quickest is not None:
+        return quickest
     all_the_time = [BlocksToCome(bare, most - bare) for bare in range(most + 1)]
     return min(all_the_time, key=lambda way: 1.0 / (so_far.bare + way.bare) + 1.0 / (so_far.loaded + way.loaded))
 

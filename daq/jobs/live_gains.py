@@ -38,7 +38,6 @@ CONNECT_S = 5.0  #: Time for the feed to accept
 END_S = 3.0  #: Time for the process to end
 NICENESS = 10  #: The recorder comes first
 SHORTEST_S = 2.1  #: Of a block before it is looked at: the filters need that
-CLEARLY_BETTER = 0.5  #: Share of the σ that was printed last
 LOST = "samples of this block were not seen in time; its log has them, and they count when it is complete"
 ENDED = "the process that estimates them after each move has ended (exit code {code}); the session goes on without it"
 _LOOK = TypeAdapter(QuickLook)
@@ -167,20 +166,16 @@ class BlockWatch:
 
 
 def tells_something_new(look: QuickLook, before: QuickLook | None) -> bool:
-    """Whether a look tells a person at the terminal more than the one before.
+    """Whether a person has not read this look: figures change with each move, what is missing does not.
 
-    Figures do where the worst gain is clearly better known, or all are at the target; those of a held-out block are
-    those of before. What is missing does once. The console shows every look.
+    Figures during a held-out block are those of before it.
     """
     if before is None:
         return True
     if look.is_held_out:
         return False
     if look.gains:
-        if not before.gains:
-            return True
-        is_at_target = look.left_s <= 0.0 < before.left_s
-        return is_at_target or look.gains[0].std_percent <= CLEARLY_BETTER * before.gains[0].std_percent
+        return True
     return look.missing != before.missing
 
 

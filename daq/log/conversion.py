@@ -375,12 +375,23 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArr
         if column.size and (column.min() < lower - margin or column.max() > upper + margin):
             unit = axis.unit
             confused = "degrees were taken for radians" if unit is DEGREE else "mm were taken for m"
+            remedy = (
+                f"most likely {confused} (or counts for either); else check motor or joint side, ratio and zero offset"
+            )
+            least = lower - margin - float(column.min())
+            most = upper + margin - float(column.max())
+            if least <= most:  # as many as the joint can make, from another zero
+                key = "zero_offset_deg" if unit is DEGREE else "zero_offset_mm"
+                remedy = (
+                    f"most likely the zero is wrong: moved by {least / unit.si:+.0f} to {most / unit.si:+.0f} "
+                    f"{unit.name}, these positions are within the limits; correct `{key}` of {axis.name} in the cell "
+                    "file, or the zero in the controller; else check motor or joint side, ratio and units"
+                )
             raise PositionImplausible(
                 f"{name}, axis {axis.name}",
                 found=f"joint positions from {column.min() / unit.si:.5g} to {unit.spell(column.max())}",
                 expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell configuration",
-                remedy=f"most likely {confused} (or counts for either); else check motor or joint side, ratio and zero "
-                "offset",
+                remedy=remedy,
             )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -32,18 +32,19 @@ from daq.workflow.diagnoses import hidden_zeros_text
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from daq.workflow.nameplates import actual_current_note
 from daq.workflow.verdicts import needed_verdicts
+from daq.writeback.gates.fit import OF_DESCRIPTION
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter, PayloadMass
 from ident.discovery.evidence import Evidence, without_effects
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.effects.effect import PlacedEffect
-from ident.errors import Diagnosis
+from ident.errors import CORRECTION_UNCLEAR, Diagnosis
 from ident.estimators.comparison import EstimatorComparison, EstimatorTrial, Removal
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import misjudged_joints
 from ident.estimators.method import Method
-from ident.estimators.turned_geometry import GEOMETRY
+from ident.estimators.turned_geometry import GRAVITY_TURNED
 from ident.model.robot import Robot
 from ident.planning.gain_verdict import GOOD_PERCENT, GainVerdict
 
@@ -107,6 +108,8 @@ class FoundGravity(Report):
     found_m_s2: list[Figure]
     turn_deg: Figure
     turn_std_deg: Figure
+    #: Other mistakes of the description, with their axes, beside which it was estimated; its σ does not cover them.
+    not_corrected: list[str]
 
 
 class CheckedGeometry(Report):
@@ -190,9 +193,9 @@ def fit_view(
     )
     notes = (
         *sigma_notes(fitted),
-        *geometry_notes(fitted.description, axes, robot_of(fitted.cell)),
+        *geometry_notes(fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses),
         *identifiability_notes(fitted, calibration.payload_mass),
-        *_advice_unless_turned(fitted, calibration),
+        *advice(fitted, needed_verdicts(fitted)),
     )
     yield from map(Sentence, notes)
     if comparison is not None:
@@ -282,7 +285,7 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
         FitReport,
         calibration,
         compared=compared,
-        geometry=checked_geometry(fitted.description, axes, robot_of(fitted.cell)),
+        geometry=checked_geometry(fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses),
         removed=_removed(found),
         verdicts=[
             GainWords.of(gain, axis=axes[gain.axis], seen_by=gain.sources, words=gain.words(axes[gain.axis]))
@@ -400,26 +403,46 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
     yield f"{mistake}{masses} A gear efficiency that is the same in both directions is part of its gain."
 
 
-def geometry_notes(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> Iterator[str]:
+def geometry_notes(
+    check: GeometryCheck | None, axes: Sequence[str], robot: Robot, diagnoses: Sequence[Diagnosis] = ()
+) -> Iterator[str]:
     """Say the direction of gravity, and the zeros that the data do not show; nothing where nothing was tested.
 
     Args:
         check: beside the fit.
         axes: their names.
         robot: as declared.
+        diagnoses: of the fit. Gravity is estimated without correcting what they name.
     """
     if check is None:
         return
     if check.gravity is not None:
         turn = np.degrees(check.gravity.turn_rad)
         std = np.degrees(check.gravity.turn_std_rad)
-        yield f"By the torques, gravity is {turn:.2f} ± {std:.2f}° from its direction in the cell file."
+        size = f"{turn:.2f} ± {std:.2f}° from its direction in the cell file"
+        others = not_corrected(diagnoses)
+        if others:
+            yield (
+                f"With the description as it is ({', '.join(others)} not corrected), the torques put gravity {size}: "
+                "its σ does not cover that, so correct it first, and fit again."
+            )
+        else:
+            yield f"By the torques, gravity is {size}."
     hidden = hidden_zeros_text(check, axes, robot)
     if hidden:
         yield hidden
 
 
-def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> CheckedGeometry | None:
+def not_corrected(diagnoses: Sequence[Diagnosis]) -> list[str]:
+    """Name the mistakes of the description, other than gravity, beside which gravity was estimated: `zero-off J2`."""
+    of_others = (OF_DESCRIPTION | {CORRECTION_UNCLEAR}) - {"gravity-tilted", GRAVITY_TURNED}
+    named = [one for one in diagnoses if one.name in of_others and not one.runs]
+    return [" ".join((one.name, *one.axes)) for one in named]
+
+
+def checked_geometry(
+    check: GeometryCheck | None, axes: Sequence[str], robot: Robot, diagnoses: Sequence[Diagnosis] = ()
+) -> CheckedGeometry | None:
     """Return what the torques say of the description of the robot; None where nothing was tested."""
     if check is None:
         return None
@@ -427,23 +450,14 @@ def checked_geometry(check: GeometryCheck | None, axes: Sequence[str], robot: Ro
     if check.gravity is not None:
         turn_deg = np.degrees(check.gravity.turn_rad)
         turn_std_deg = np.degrees(check.gravity.turn_std_rad)
-        gravity = FoundGravity.of(check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg)
+        gravity = FoundGravity.of(
+            check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg, not_corrected=not_corrected(diagnoses)
+        )
     causes = {axes[axis]: zero_hidden_by(robot, axis) for axis in check.hidden_zeros}
     pairs = [(axes[first], axes[second]) for first, second in check.hidden_pairs]
     return CheckedGeometry(
         gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes, hidden_zero_pairs=pairs
     )
-
-
-def _advice_unless_turned(fitted: Fit, calibration: Calibration) -> Iterator[str]:
-    """As `advice`; nothing in a geometry that is wrong: no number means anything there."""
-    if not names_turned_geometry(calibration.diagnoses):
-        yield from advice(fitted, needed_verdicts(fitted))
-
-
-def names_turned_geometry(diagnoses: Iterable[Diagnosis]) -> bool:
-    """Whether a fit says that gravity, a zero or the sense of a position is far from what is described."""
-    return any(one.name in GEOMETRY and not one.runs for one in diagnoses)
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:

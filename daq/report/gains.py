@@ -251,10 +251,10 @@ def _factor_text(found: re.Match[str]) -> str:
     return f"{found[1]}·"
 
 
-def with_deviation(value: float, std: float) -> str:
+def with_deviation(value: float, std: float, sign: str = "") -> str:
     """Write `33.90 ± 0.14`, to the second digit of σ (ISO Guide 98-3, 7.2.6).
 
-    `32.96 (fixed)` where σ is 0, `-` without a value.
+    `32.96 (fixed)` where σ is 0, `-` without a value. A `sign` of "+" is written before positive values, too.
     """
     if not math.isfinite(value):
         return "-"
@@ -263,4 +263,4 @@ def with_deviation(value: float, std: float) -> str:
     if not math.isfinite(std) or std < 0:
         return f"{value:.4g} ± {std:g}"
     decimals = max(1 - math.floor(math.log10(std)), 0)
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+    return f"{value:{sign}.{decimals}f} ± {std:.{decimals}f}"

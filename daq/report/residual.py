@@ -9,18 +9,20 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 
 from daq.errors import counted
 from daq.report.effect_names import effect_text, size_text, variable_text
-from daq.report.fit import error_table, identifiability_notes, sigma_notes
-from daq.report.gains import diagnosis_texts, gain_table, partial_note
+from daq.report.fit import coefficients, error_table, identifiability_notes, sigma_notes
+from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
 from daq.report.split_names import names_by_split, placed_by
 from daq.report.text import Sentence, break_lines, plain_table
 from daq.workflow.fit import Fit
+from daq.writeback.gates.fit import OF_DESCRIPTION
 from ident.calibration import AcceptedEffect, Calibration
-from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
+from ident.discovery.before_after import Account, BeforeAfter, GainShift, RelativeErrors
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.gates import runs_to_leave_out
 from ident.discovery.gear_loss import CERTAIN, GearLoss, gear_losses, is_gear_loss
@@ -92,12 +94,15 @@ class Headline:
     judged: tuple[str, ...]  #: effects that held-out runs do not confirm
     refused: tuple[str, ...]  #: effects with which `apply` refuses the calibration
     gains: tuple[str, ...]  #: whether gains have changed
+    explained: tuple[str, ...]  #: what the fit before the search named, and the search does not
+    to_record: tuple[str, ...]  #: which moves would make uncertain gains better
     ending: tuple[str, ...]  #: time skew, and the verdict of held-out runs
 
     def sentences(self) -> tuple[str, ...]:
         """Return all of them, in the order in which they are read."""
-        found = (*self.checks, *self.effects, self.together, *self.judged, *self.refused, *self.gains, *self.ending)
-        return tuple(sentence for sentence in found if sentence)
+        found = (*self.checks, *self.effects, *self.explained, self.together, *self.judged, *self.refused)
+        after = (*self.gains, *self.to_record, *self.ending)
+        return tuple(sentence for sentence in (*found, *after) if sentence)
 
     def parts(self) -> Iterator[Sentence]:
         """Return all of them as parts of a view."""
@@ -107,7 +112,7 @@ class Headline:
     def by_weight(self) -> tuple[str, ...]:
         """Return them in the order in which a screen gets them: what decides on the calibration comes first."""
         first = (self.together, *self.refused, *self.checks[:1], *self.ending)
-        ordered = (*first, *self.checks[1:], *self.effects, *self.judged, *self.gains)
+        ordered = (*first, *self.checks[1:], *self.effects, *self.explained, *self.judged, *self.gains, *self.to_record)
         return tuple(sentence for sentence in ordered if sentence)
 
 
@@ -252,14 +257,16 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
             found += [_effect_sentence(fitted, account, turn, placed, step) for placed in added]
     before, _ = _strictest_error(account.total.before)
     after, where = _strictest_error(account.total.after)
-    floor = _floor(account).total
-    noise = f" ({_floor_text(floor)})" if math.isfinite(floor) else ""
+    noise_text = _noise_text(account)
+    noise = "" if noise_text == UNKNOWN_NOISE else f" ({noise_text})"
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
     judged = tuple(verdict_sentences(fitted))
+    explained = tuple(_explained_checks(fitted, account))
+    to_record = tuple(f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain)
     if not found:
         none = "No effect is confirmed" if judged else "No structure found"
         together = f"{none}: the error {where} is {after.total:.1f} %{noise}."
-        return Headline(tuple(checks), (), together, judged, (), (), ending)
+        return Headline(tuple(checks), (), together, judged, (), (), explained, to_record, ending)
     change = error_change_text(before.total, after.total)
     return Headline(
         checks=tuple(checks),
@@ -268,8 +275,34 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
         judged=judged,
         refused=tuple(_to_be_refused(effects)),
         gains=(gains_sentence(fitted, account),),  # empty of gains that were held
+        explained=explained,
+        to_record=to_record,
         ending=ending,
     )
+
+
+def _explained_checks(fitted: Fit, account: Account) -> Iterator[str]:
+    """Take up what the fit before the search has named and the fit with the effects does not."""
+    named = {(one.name, one.axes) for one in fitted.diagnoses}
+    corrected: set[str] = set()
+    for one in fitted.diagnoses:
+        if one.name in OF_DESCRIPTION:
+            corrected.update(one.axes)
+    for one in fitted.diagnoses_before:
+        is_named_otherwise = one.name in OF_DESCRIPTION and not corrected.isdisjoint(one.axes)
+        if (one.name, one.axes) in named or is_named_otherwise:
+            continue
+        subject = ", ".join((*one.runs, *one.axes)) or "the fit"
+        changes: list[str] = []
+        for axis in one.axes:
+            place = fitted.cell.axis_names.index(axis)
+            before, where = _strictest_error(account.total.before, place)
+            after, _ = _strictest_error(account.total.after, place)
+            change = error_change_text(before.at(place), after.at(place))
+            changes.append(f"the error of the current of {axis} {where} {change}")
+        errors = f": {'; '.join(changes)}" if changes else ""
+        said = f"CHECK {subject}: {one.found} ({one.name})"
+        yield f"Without the effects, the fit said {said}. With them it does not{errors}."
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:
@@ -305,6 +338,7 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     sentences += _on_few_moves(fitted)
     sentences += gear_sentences(fitted)
     sentences += floor_sentences(account, fitted.cell.axis_names)
+    sentences += kinds_of_error(fitted)
     is_judged_on_runs = bool(last.verdicts) or bool(runs_to_leave_out(last.after.training))
     if last.after.effects and not is_judged_on_runs:
         sentences.append(
@@ -336,18 +370,34 @@ def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
         )
 
 
+NOTABLE_SIGMAS = 2.5  #: Difference of a gain from which it is said, although among all axes noise may make it
+
+
 def gains_sentence(fitted: Fit, account: Account) -> str:
-    """Say which gains the effects change by more than noise; empty where the gains were held."""
+    """Say which gains the effects change by more than noise, else the largest difference; empty for held gains."""
     if fitted.estimate.gains_fixed:
         return ""
-    changes = zip(fitted.cell.axis_names, account.total.gains, strict=True)
+    names = fitted.cell.axis_names
+    changes = list(zip(names, account.total.gains, strict=True))
     changed = [f"{axis} by {change.change_percent:+.1f} %" for axis, change in changes if change.significant]
-    if not changed:
+    among_all = f"more than noise (probability below {100 * FALSE_ALARM:g} % among all axes)"
+    if changed:
+        return f"The effects change gains by {among_all}: {', '.join(changed)} of the gain without them."
+    notable = [one for one in changes if _is_notable(one[1], fitted.cell.target_sigma_percent)]
+    if not notable:
         return "With and without the effects, the gains are the same within noise."
+    axis, change = max(notable, key=lambda one: abs(one[1].change_percent))
+    size = with_deviation(change.change_percent, change.change_std_percent, sign="+")
     return (
-        f"The effects change gains by more than noise (probability below {100 * FALSE_ALARM:g} % among all axes): "
-        f"{', '.join(changed)} of the gain without them."
+        f"The effects change no gain by {among_all}; the largest difference is {size} % of the gain of {axis} without "
+        "them."
     )
+
+
+def _is_notable(change: GainShift, target_percent: float) -> bool:
+    """Whether the difference of a gain is large: in its own σ, or for the σ that the cell asks of its gains."""
+    is_beyond_sigma = abs(change.change_percent) > NOTABLE_SIGMAS * change.change_std_percent
+    return is_beyond_sigma or abs(change.change_percent) > target_percent
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
@@ -441,6 +491,18 @@ def _on_few_moves(fitted: Fit) -> Iterator[str]:
         name = placed_by(finding).axis_name(axes)
         effect = effect_text(finding.effect, axes)
         yield f"These moves do not tell whether {name} has {effect}: {finding.too_few_moves}."
+
+
+def kinds_of_error(fitted: Fit) -> Iterator[str]:
+    """Say which errors are those of currents, where they differ from those of the joints' torques."""
+    ratio = fitted.identification.model.drive_train.ratio
+    motors = np.count_nonzero(ratio, axis=0)
+    names = [name for name, count in zip(fitted.cell.axis_names, motors, strict=True) if count > 1]
+    if names:
+        yield (
+            "The errors of a search are those of the motors' currents. `fit`, `validate` and the certificate have "
+            f"those of the joints' torques, which differ where several motors act on a joint ({', '.join(names)})."
+        )
 
 
 _FLOOR_CAUSES = {
@@ -590,6 +652,8 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     after, _ = _strictest_error(turn.after, place)
     if is_correction(placed):  # it is judged by all motors together
         subject = name if placed.effect.has_axis else "The recording"
+        if f"{before.total:.1f}" == f"{after.total:.1f}":
+            return f"{subject} has {what}{_hardly_shown_text(fitted, placed, step, before, after, where)}."
         change = error_change_text(before.total, after.total)
         return f"{subject} has {what}: the error of all axes {where} {change}."
     if not placed.effect.has_axis:
@@ -601,8 +665,30 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     if without * (1.0 - SLIGHT) < with_it <= without:
         what += ", a small effect"
     whose = name if placed.axis < len(fitted.cell.axes) else "all axes"
-    noise = _floor_text(_floor(account).at(placed.axis))
+    noise = _noise_text(account, placed.axis)
     return f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} ({noise})."
+
+
+def _hardly_shown_text(
+    fitted: Fit, placed: PlacedEffect, step: Step, before: RelativeError, after: RelativeError, where: str
+) -> str:
+    """Say of a correction that the error of all axes hardly shows: its own σ, and the axis that shows it most."""
+    final = fitted.steps[-1].after
+    sizes = coefficients(final if placed in final.effects else step.after, placed)
+    sigmas = math.hypot(*(one.value / one.std for one in sizes if one.std > 0.0))
+    certain = f", by {sigmas:.0f} σ" if sigmas else ""
+    text = (
+        f"{certain}: it hardly shows in the error of all axes {where}, {before.total:.2f} % without it and "
+        f"{after.total:.2f} % with it"
+    )
+    names = fitted.cell.axis_names
+    falls = {name: 1.0 - last / first for name, first, last in zip(names, before.axes, after.axes, strict=True)}
+    falls = {name: fall for name, fall in falls.items() if fall > 0.0}
+    if not falls:
+        return text
+    axis = max(falls, key=falls.__getitem__)
+    place = names.index(axis)
+    return f"{text}; most in that of {axis}, {before.at(place):.2f} and {after.at(place):.2f} %"
 
 
 def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
@@ -614,14 +700,30 @@ def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
     return f"parts of the moves call it {' or '.join(counted)}"
 
 
-def _floor(account: Account) -> RelativeError:
-    """Lower limit of the error by noise, on the rows that `_strictest_error` is measured on."""
-    return account.least_floor if account.least_holdout_floor is None else account.least_holdout_floor
+def _noise_text(account: Account, place: int | None = None) -> str:
+    """Say how much of an error noise leaves, to stand in brackets: its lower limit, else the estimate.
+
+    Both are on the rows that `_strictest_error` is measured on.
+
+    Args:
+        account: of the search.
+        place: of the axis; None for all together.
+    """
+    least = account.least_floor
+    estimate = account.floor
+    if account.least_holdout_floor is not None and account.holdout_floor is not None:
+        least = account.least_holdout_floor
+        estimate = account.holdout_floor
+    least_percent = least.total if place is None else least.at(place)
+    if math.isfinite(least_percent):
+        return f"noise leaves at least {least_percent:.1f} %"
+    percent = estimate.total if place is None else estimate.at(place)
+    if math.isfinite(percent):
+        return f"noise leaves {percent:.1f} %, an estimate"
+    return UNKNOWN_NOISE
 
 
-def _floor_text(floor_percent: float) -> str:
-    """Say how much of an error noise leaves, to stand in brackets."""
-    return f"noise leaves at least {floor_percent:.1f} %" if math.isfinite(floor_percent) else "noise floor not known"
+UNKNOWN_NOISE = "noise floor not known"
 
 
 def _silence(fitted: Fit) -> str:

@@ -76,10 +76,11 @@ from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
-from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
+from ident.model.suggested_gravity import suggested_gravity
 from ident.model.urdf import read_urdf
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
@@ -175,14 +176,33 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
     except (EffectImpossible, ModelContradicted, NotConverged, PayloadUnseen):
         turned = turned_geometry(recordings, (), None)
         if turned is not None:
-            raise GeometryTurned(
-                ", ".join(turned.axes) or "the mounting",
-                found=turned.found,
-                expected=turned.expected,
-                remedy=turned.remedy,
-            ) from None
+            raise _as_error(turned) from None
         require_right_currents(recordings)
         raise
+
+
+def geometry_refusal(diagnoses: Sequence[Diagnosis]) -> GeometryTurned | None:
+    """Return the error for gains that mean nothing, because their fit is one in a wrong geometry; None for others.
+
+    What is said of a held-out run alone leaves the gains of the others as they are.
+
+    Args:
+        diagnoses: of a fit and of its held-out runs.
+    """
+    for one in diagnoses:
+        if one.name in GEOMETRY and not one.runs:
+            return _as_error(one)
+    return None
+
+
+def _as_error(turned: Diagnosis) -> GeometryTurned:
+    """Return the error that says the same as a diagnosis of the geometry."""
+    return GeometryTurned(
+        ", ".join(turned.axes) or "the mounting",
+        found=turned.found,
+        expected=turned.expected,
+        remedy=turned.remedy,
+    )
 
 
 def turned_geometry(
@@ -455,7 +475,9 @@ def _beside_alike(
     )
 
 
-def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str]) -> Diagnosis:
+def drift_diagnosis(
+    drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str], *, is_given: bool = False
+) -> Diagnosis:
     """Diagnosis of a geometry that has changed since a calibration.
 
     Args:
@@ -463,6 +485,7 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
         model: as declared.
         axes: names of its axes.
         runs: name of the run.
+        is_given: a description that was given changes this number of the log's own one.
     """
     placed = drift.placed
     name = axes[placed.axis]
@@ -481,6 +504,11 @@ def drift_diagnosis(drift: GeometryDrift, model: Model, axes: Sequence[str], run
             expected = "the mounting of the calibration"
             remedy = "level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew"
     found += f"; it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+    if is_given:
+        remedy = (
+            "the given cell file has another number here than the description in the log: correct the cell file, or "
+            f"if it is right, {remedy}"
+        )
     return _diagnosis_of(placed, name, runs, found, expected, remedy)
 
 
@@ -543,7 +571,8 @@ def _correction_diagnosis(
             )
         case _:
             declared = model.robot.gravity_m_s2
-            turned = vector_text(turned_gravity(declared, values.tolist()))
+            found_m_s2 = turned_gravity(declared, values.tolist())
+            turned = vector_text(suggested_gravity(found_m_s2, float(np.max(deviations))))
             found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
             expected = f"{vector_text(declared)}, as the cell file says"
             remedy = (

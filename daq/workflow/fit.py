@@ -61,6 +61,7 @@ from ident.estimators.refusals import require_plausible
 from ident.estimators.turned_geometry import GEOMETRY
 from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Model
+from ident.planning.gain_verdict import GainVerdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,9 @@ class Fit:
     geometry: GeometryFinding | None = None
     #: Covariance that the corrected geometry adds to gains and parameters; None where the described one was used.
     geometry_covariance: FloatArray | None = None
+    diagnoses_before: tuple[Diagnosis, ...] = ()  #: of the fit before a search; empty where none was made
+    #: Verdicts on the gains that are not known well enough; empty where all are, or where nobody has asked.
+    uncertain: tuple[GainVerdict, ...] = ()
 
     @property
     def is_corrected(self) -> bool:
@@ -495,7 +499,7 @@ def close_loop(
         IdentificationError: a refit failed.
     """
     described = start.estimate
-    start = _with_geometry_of_encoders(start)
+    start = replace(_with_geometry_of_encoders(start), diagnoses_before=start.diagnoses)
     known = start.steps  # with what the cell declares
     evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]

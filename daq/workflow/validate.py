@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from daq.config.cell import Cell, model_of
-from daq.config.same_cell import mismatch_of_calibration
+from daq.config.same_cell import GRAVITY as GRAVITY_SECTION
+from daq.config.same_cell import differing_zeros, mismatch_of_calibration
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.diagnoses import DIAGNOSED_AS, drift_diagnosis, with_verbs
@@ -376,7 +377,8 @@ def cross_validate(
             standard = _standard_system(first_own, model, run, conditioning)
             condition = _condition(calibrations[first], standard)
         if standard is not None and first in found and not found[first].is_judged:
-            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning)
+            suspected = replaced_geometry(first_own, run, described)
+            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning, suspected)
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
@@ -446,7 +448,8 @@ def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell)
     conditioning = conditioning_of(calibration)
     with suppress(IdentificationError):
         standard = _standard_system(calibration, model, run, conditioning)
-        return diagnose_run(calibration, validation, model, run, standard, conditioning)
+        suspected = replaced_geometry(calibration, run, described)
+        return diagnose_run(calibration, validation, model, run, standard, conditioning, suspected)
     return ()
 
 
@@ -494,6 +497,7 @@ def diagnose_run(
     run: Run,
     standard: System,
     conditioning: Conditioning,
+    suspected: Sequence[PlacedEffect] = (),
 ) -> tuple[Diagnosis, ...]:
     """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
 
@@ -504,6 +508,7 @@ def diagnose_run(
         run: as it was read.
         standard: equations of this run alone, in standard parameters (`reduce_runs`).
         conditioning: the filters.
+        suspected: of `replaced_geometry`.
 
     Raises:
         CurrentConstant: a motor moves, and its current has one value.
@@ -516,9 +521,9 @@ def diagnose_run(
     carried = replace(run, payload=as_calibrated(calibration, run.payload, run.name))
     data = differentiate(carried, model.drive_train, conditioning)
     left_nm = validation.measured_nm - validation.predicted_nm
-    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use)
+    moved = geometry_drift(calibration, model, data, conditioning, left_nm, use, suspected)
     if moved is not None:
-        return (drift_diagnosis(moved, model, axes, runs),)
+        return (drift_diagnosis(moved, model, axes, runs, is_given=moved.placed in suspected),)
     size = _rms(validation.measured_nm, use)
     left = _rms(left_nm, use)
     idle = idle_joints(model, size, left)
@@ -540,6 +545,26 @@ def diagnose_run(
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
+
+
+def replaced_geometry(calibration: Calibration, run: Run, described: Cell) -> tuple[PlacedEffect, ...]:
+    """Return the corrections of zeros and gravity that a given description makes in that of a log.
+
+    There are none where the calibration was made with the given description: it predicts in the same geometry.
+
+    Args:
+        calibration: that predicts.
+        run: as it was read.
+        described: the given description.
+    """
+    if run.recording is None or described.recording_digest == calibration.recording_configuration_sha256:
+        return ()
+    sections = run.recording.corrected
+    axes = described.axis_names
+    replaced = [PlacedEffect(ZeroOffset(), axes.index(name)) for name in differing_zeros(sections)]
+    if GRAVITY_SECTION in sections:
+        replaced.append(PlacedEffect(GravityDirection(), 0))
+    return tuple(replaced)
 
 
 def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:

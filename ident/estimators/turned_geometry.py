@@ -47,6 +47,7 @@ from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
 from ident.model.robot import JointKind, Motion
+from ident.model.suggested_gravity import suggested_gravity
 
 GRAVITY_TURNED = "gravity-turned"
 POSITION_REVERSED = "position-reversed"
@@ -77,10 +78,12 @@ RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations t
 FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
 TURN_ROUNDS = 6  #: Of Gauss-Newton
 LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
-UNTIL_RIGHT = "gains and errors mean nothing until it is right"  #: End of each remedy
+UNTIL_RIGHT = "gains and errors mean nothing until it is right"  #: End of each remedy for a fit
+RUN_UNTIL_RIGHT = "what is predicted of this run means nothing until it is right"
+"""The same for a run that the fit has not seen: its gains are those of other recordings."""
 WHICH_IS_WRONG = (
     "these moves do not tell them apart: look how the base is mounted and where the zeros are, or record moves through "
-    f"more of the range of all joints; correct what is wrong, and fit again: {UNTIL_RIGHT}"
+    "more of the range of all joints; correct what is wrong, and fit again"
 )
 """Remedy where several explain the same."""
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
@@ -161,15 +164,18 @@ class TurnedGeometry:
             axes: their names.
             runs: that it was found in, empty for those of a fit.
         """
+        until_right = RUN_UNTIL_RIGHT if runs else UNTIL_RIGHT
+        which_is_wrong = f"{WHICH_IS_WRONG}: {until_right}"
         errors = f"errors of {_percents(self.after_percent)} % of the currents of left-out moves"
         declared = f"{_percents(self.before_percent)} % as declared"
         alike = [one.text(axes) for one in self.readings[0 if self.gravity is not None else 1 :]]
         others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
+            suggested_m_s2 = suggested_gravity(found.found_m_s2, float(np.deg2rad(found.std_deg)))
             remedy = (
-                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(found.found_m_s2)} m/s² by "
-                f"these recordings; {UNTIL_RIGHT}"
+                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(suggested_m_s2)} m/s² by "
+                f"these recordings; {until_right}"
             )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
             return Diagnosis(
@@ -179,7 +185,7 @@ class TurnedGeometry:
                 f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
                 f"the cell says, with {errors}, {declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
-                WHICH_IS_WRONG if alike else remedy,
+                which_is_wrong if alike else remedy,
             )
         reading = self.readings[0]
         name = axes[reading.axis]
@@ -187,7 +193,7 @@ class TurnedGeometry:
             turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
             remedy = (
                 f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
-                f"controller, and fit again: {UNTIL_RIGHT}"
+                f"controller, and fit again: {until_right}"
             )
             return Diagnosis(
                 ZERO_TURNED,
@@ -195,7 +201,7 @@ class TurnedGeometry:
                 (name,),
                 f"{reading.text(axes)}: so read, its position leaves {errors}, {declared}{others}",
                 "positions whose zero is that of the URDF",
-                WHICH_IS_WRONG if alike else remedy,
+                which_is_wrong if alike else remedy,
             )
         if reading.axis in self.reversed_currents:
             remedy = (
@@ -213,7 +219,7 @@ class TurnedGeometry:
             (name,),
             f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
             "each position to count about the axis of its joint in the URDF",
-            f"{remedy}; {UNTIL_RIGHT}",
+            f"{remedy}; {until_right}",
         )
 
 

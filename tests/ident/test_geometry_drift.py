@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
 
@@ -15,8 +16,9 @@ from ident.data.run import Run
 from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence
 from ident.effects.effect import PlacedEffect
-from ident.effects.geometry_corrections import GravityDirection, rotation_by
+from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, rotation_by
 from ident.equations.rows import decimate_rows, row_masks
+from ident.estimators.estimate import RelativeError
 from ident.geometry_drift import GeometryDrift, geometry_drift
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque
@@ -48,14 +50,16 @@ def _fitted() -> tuple[Evidence, Calibration]:
     return evidence, calibration_of(evidence.identification, AXES, (1.0,) * 6)
 
 
-def _drift(run: Run, model: Model, known: Calibration | None = None) -> GeometryDrift | None:
+def _drift(
+    run: Run, model: Model, known: Calibration | None = None, suspected: Collection[PlacedEffect] = ()
+) -> GeometryDrift | None:
     evidence, calibration = _fitted()
     calibration = known or calibration
     data = differentiate(run, model.drive_train, evidence.conditioning)
     use, _ = row_masks(model, data, evidence.conditioning)
     left = measured_torque(calibration, model, data.current_a) - predict_torque(calibration, model, data)
     left_nm = decimate_rows(data, evidence.conditioning, left.T)
-    return geometry_drift(calibration, model, data, evidence.conditioning, left_nm, use)
+    return geometry_drift(calibration, model, data, evidence.conditioning, left_nm, use, suspected)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -66,6 +70,36 @@ def test_a_lost_zero_is_named_with_its_size(axis: int) -> None:
     assert found is not None
     assert (found.placed.effect.name, found.placed.axis) == ("zero-offset", axis)
     assert np.degrees(found.values[0]) == pytest.approx(-3.0, abs=0.5)
+
+
+def _offset(run: Run, axis: int, degrees: float) -> Run:
+    position = run.position_rad.copy()
+    position[:, axis] += np.radians(degrees)
+    return replace(run, position_rad=position)
+
+
+def test_of_two_zeros_that_explain_the_error_the_one_that_explains_more_is_named() -> None:
+    """Both explain more than what the error is larger than in a fit that left much."""
+    _, calibration = _fitted()
+    errors = RelativeError((2.5,) * 6, 2.5)
+    found = _drift(_offset(_new_run(), 2, 3.0), tx40_truth().model, replace(calibration, relative_error_percent=errors))
+    assert found is not None
+    assert found.placed == PlacedEffect(ZeroOffset(), 2)
+
+
+def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
+    rng = np.random.default_rng(3)
+    run = _offset(_new_run(), 1, 2.0)
+    slow = np.repeat(rng.standard_normal((len(run.time_s) // 50 + 1, 6)), 50, axis=0)[: len(run.time_s)]
+    disturbed = replace(run, current_a=run.current_a + 0.03 * slow)
+    model = tx40_truth().model
+    assert _drift(disturbed, model) is None
+    suspected = (PlacedEffect(ZeroOffset(), 1),)
+    found = _drift(disturbed, model, suspected=suspected)
+    assert found is not None
+    assert found.placed in suspected
+    assert np.degrees(found.values[0]) == pytest.approx(-2.0, abs=0.5)
+    assert _drift(_new_run(), model, suspected=suspected) is None
 
 
 def test_a_moved_base_is_named() -> None:

@@ -57,7 +57,7 @@ def test_a_wrong_mounting_is_named(
     cell = tmp_path / "turned.yaml"
     cell.write_text(turned)
     capsys.readouterr()
-    assert main(["fit", str(tx40), "--gains", "fixed", "--cell", str(cell), "--json"]) == ExitCode.OK
+    assert main(["fit", str(tx40), "--gains", "fixed", "--cell", str(cell), "--json"]) == ExitCode.DATA_UNFIT
     (diagnosis,) = json.loads(capsys.readouterr().out)["diagnoses"]
     assert diagnosis["name"] == "gravity-turned"
     found = re.match(r"gravity along \[(\S+), (\S+), (\S+)\]", diagnosis["found"])

@@ -35,7 +35,7 @@ def test_a_look_is_printed_where_the_errors_go_now(looks: Looks, capsys: pytest.
     looks.show(replace(LOOK, move=4))
     looks.show(replace(LOOK, move=5, gains=[replace(LOOK.gains[0], std_percent=0.1)]))
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(",")[1] for line in said] == [" move 3 of 9", " move 5 of 9"]
+    assert [line.split(",")[1] for line in said] == [" move 3 of 9", " move 4 of 9", " move 5 of 9"]
     assert looks.remark == "moves, J1 ± 0.10 % (target 0.5 %)"
 
 

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from daq.cli.app import main
-from daq.cli.fit import end_if_turned
+from daq.cli.fit import ResidualRequest, _say_after_search
 from daq.cli.next_step import (
     FolderRuns,
     free_name,
@@ -27,12 +26,13 @@ from daq.cli.next_step import (
 )
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.errors import ExitCode
+from daq.documents.calibration_file import load_calibration
 from daq.workflow import plan as plan_module
 from daq.workflow.plan import Plan, load_plan, save_plan
 from ident.calibration import AcceptedEffect
 from ident.errors import Diagnosis
-from tests.daq.calibrations import demo_calibration
+from ident.estimators.estimate import RelativeError
+from tests.daq.calibrations import calibration_for, demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
 from tests.pipeline.next_step import next_step
 
@@ -187,9 +187,9 @@ def test_a_calibration_is_followed_by_its_dry_run(
     cell: Cell, make_log: LogMaker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = make_log("bare.mcap")
-    Path("calibration.yaml").touch()
-    say_after_calibration(demo_calibration(), Path("calibration.yaml"), [log], None)
-    assert words(capsys.readouterr().err) == ["drivegain", "apply", str(CELL), "calibration.yaml"]
+    file = calibration_for(CELL)
+    say_after_calibration(load_calibration(file), file, [log], None)
+    assert words(capsys.readouterr().err) == ["drivegain", "apply", str(CELL), str(file)]
     fixed = replace(demo_calibration(), gains=tuple(replace(gain, std=0.0) for gain in demo_calibration().gains))
     assert fixed.gains_fixed
     say_after_calibration(fixed, Path("calibration.yaml"), [log], CELL)
@@ -210,6 +210,7 @@ def test_other_moves_come_before_a_search_and_a_write_where_a_gain_is_not_seen(
 
 ZERO_OFF = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off by +2.00 ± 0.10 °", "that of the URDF", "correct it")
 OTHER_BODY = Diagnosis("payload-differs", ("loaded",), (), "a body", "another", "was it turned?")
+LARGE = RelativeError((40.0,) * 6, 40.0)
 CORRECTED = AcceptedEffect("zero-offset", "J2", {}, (), 6.0, 3.0)
 REFUTED = AcceptedEffect("stribeck", "J2", {}, (), 3.0, 6.0)
 
@@ -222,8 +223,22 @@ REFUTED = AcceptedEffect("stribeck", "J2", {}, (), 3.0, 6.0)
         ({}, (OTHER_BODY,), "Next: find the cause of what CHECK says"),
         ({"effects": (REFUTED,)}, None, "`drivegain apply` refuses this calibration: effect stribeck on J2"),
         ({"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)}, (), "Next: drivegain apply"),
+        (
+            {"recording_configuration_sha256": "c" * 64},
+            None,
+            "refuses this calibration: calibration: recorded with cell",
+        ),
+        ({"relative_error_percent": LARGE, "holdout_error_percent": LARGE}, None, "a relative error of 40.0 %"),
     ],
-    ids=["a description that the fit corrects", "another body", "of another log", "a gate", "corrected since"],
+    ids=[
+        "a description that the fit corrects",
+        "another body",
+        "of another log",
+        "a gate",
+        "corrected since",
+        "another description",
+        "its error",
+    ],
 )
 def test_nothing_is_written_before_what_is_wrong_is_corrected(
     cell: Cell,
@@ -232,10 +247,32 @@ def test_nothing_is_written_before_what_is_wrong_is_corrected(
     printed: tuple[Diagnosis, ...] | None,
     expected: str,
 ) -> None:
-    say_after_calibration(replace(demo_calibration(), **changed), Path("calibration.yaml"), [], CELL, printed)
+    file = calibration_for(CELL, **changed)
+    say_after_calibration(load_calibration(file), file, [], CELL, printed)
     said = capsys.readouterr().err
     assert expected in said
     assert ("Next: drivegain apply" in said) == (expected == "Next: drivegain apply")
+
+
+def test_a_calibration_that_the_cell_of_the_logs_refuses_is_not_applied_next(
+    cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The certificate of the same search says that it must not be written."""
+    doubtful = load_calibration(calibration_for(CELL, relative_error_percent=LARGE, holdout_error_percent=LARGE))
+    shutil.rmtree("configs")
+    assert say_after_calibration(doubtful, Path("calibration.yaml"), [], None, described=cell)
+    assert "`drivegain apply` refuses this calibration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("diagnoses", [(ZERO_OFF,), ()], ids=["zero off", "right"])
+def test_a_search_that_wrote_nothing_names_itself_only_where_nothing_is_to_be_corrected(
+    cell: Cell, capsys: pytest.CaptureFixture[str], diagnoses: tuple[Diagnosis, ...]
+) -> None:
+    calibration = replace(load_calibration(calibration_for(CELL)), diagnoses=diagnoses)
+    _say_after_search(ResidualRequest(logs=[Path("bare.mcap")], cell=CELL), calibration, cell)
+    said = capsys.readouterr().err
+    assert ("Next: correct the description" in said) == bool(diagnoses)
+    assert ("Next: drivegain residual bare.mcap" in said) == (not diagnoses)
 
 
 @pytest.mark.parametrize("simulated", [False, True])
@@ -263,25 +300,3 @@ def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     assert "Replaced: plan.yaml (of" in said
     assert "Replaced: plan.html (of" in said
     assert plan_module.plan_head(Path("plan.yaml")).seed == 1
-
-
-@pytest.mark.parametrize(
-    ("name", "runs", "code"),
-    [
-        ("position-reversed", (), ExitCode.DATA_UNFIT),
-        ("zero-turned", (), ExitCode.DATA_UNFIT),
-        ("position-reversed", ("held-out",), None),
-        ("zero-off", (), None),
-    ],
-)
-def test_a_fit_in_a_turned_geometry_ends_as_one_that_is_refused(
-    name: str, runs: tuple[str, ...], code: ExitCode | None
-) -> None:
-    diagnosis = Diagnosis(name, runs, ("J2",), "another way", "its axis", "correct it")
-    calibration = replace(demo_calibration(), diagnoses=(diagnosis,))
-    if code is None:
-        end_if_turned(calibration)
-        return
-    with pytest.raises(typer.Exit) as ended:
-        end_if_turned(calibration)
-    assert ended.value.exit_code == code

@@ -12,7 +12,7 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.config.same_cell import correction_of, differing_sections, mismatch
+from daq.config.same_cell import correction_of, differing_sections, differing_zeros, mismatch
 from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
 from daq.errors import ExitCode, LogsDiffer
 from daq.log.conversion import load_run
@@ -246,3 +246,12 @@ def test_every_verb_refuses_the_description_of_another_robot(
     said = " ".join(capsys.readouterr().err.split())
     assert "'demo'" in said
     assert "'press'" in said
+
+
+def test_the_axes_whose_zeros_differ_are_found_among_the_sections(checkout: Path, demo: Path, tmp_path: Path) -> None:
+    other = _copy(
+        checkout, tmp_path, lambda text: text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 2.0", 2), "o.yaml"
+    )
+    sections = differing_sections(load_cell(demo), load_cell(other))
+    assert differing_zeros(sections) == ("J1", "J2")
+    assert differing_zeros(("axes.limits (J1)", "robot.gravity_m_s2")) == ()

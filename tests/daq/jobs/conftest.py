@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
+from daq.jobs import guided
+from daq.workflow.experiment import Experiment
+from daq.workflow.fit import Fit
+from daq.workflow.outlook import Outlook, outlook_of
+from ident.arrays import FloatArray
 from tests.daq.jobs.made import Made, whole_job
 from tests.daq.jobs.made_session import MadeSession, whole_session
 from tests.daq.jobs.rig import Rig, make_plan
@@ -53,3 +60,19 @@ def whole_session_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, M
 def made_session(whole_session: tuple[Rig, MadeSession]) -> MadeSession:
     """Its logs and its fit."""
     return whole_session[1]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _outlooks_once() -> Iterator[None]:
+    """All sessions that copy the one that was made have its fit, whose outlook is computed once for each question."""
+    known: dict[tuple[int, bytes], tuple[Fit, Outlook]] = {}
+
+    def outlook_once(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> Outlook:
+        question = id(fitted), pickle.dumps((experiment, std_percent))
+        if question not in known:
+            known[question] = fitted, outlook_of(fitted, experiment, std_percent)
+        return known[question][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(guided, "outlook_of", outlook_once)
+        yield

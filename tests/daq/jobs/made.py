@@ -14,6 +14,7 @@ from daq.jobs.context import Tools
 from daq.workflow.fit import Fit
 from daq.workflow.record import Recorded, RecordingRequest
 from ident.calibration import Calibration
+from ident.discovery.before_after import Account
 from tests.daq.jobs.rig import Rig, make_plan, make_rig, powerless, serving
 
 
@@ -26,7 +27,8 @@ class Made:
         logs: by their runs' names.
         recorded: what the recorder reported on each.
         fitted, closed: before and after the loop.
-        calibration: of the latter.
+        changed: what the loop has changed.
+        calibration: of the fit after the loop.
     """
 
     plan_file: Path
@@ -34,6 +36,7 @@ class Made:
     recorded: dict[str, Recorded]
     fitted: Fit
     closed: Fit
+    changed: Account
     calibration: Calibration
 
     def tools(self, rig: Rig, **factors: float) -> Tools:
@@ -81,6 +84,7 @@ class Made:
             record=copied,
             fit=lambda logs, *, holdout: self.fitted,
             close_loop=lambda _fit, _seed, _report: self.closed,
+            account=lambda _start, _steps: self.changed,
             calibration=in_this_cell,
         )
 
@@ -119,10 +123,10 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         return called
 
     rig.tools = replace(
-        tools, record=keep_record, fit=keep("fit"), close_loop=keep("close_loop"), calibration=keep("calibration")
+        tools, record=keep_record, **{name: keep(name) for name in ("fit", "close_loop", "account", "calibration")}
     )
     with serving(rig) as cell_there:
         rig.job()
         assert powerless(cell_there)
     logs = {name: rig.session.folder / f"{name}.mcap" for name in recorded}
-    return rig, Made(plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["calibration"])
+    return rig, Made(plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["account"], kept["calibration"])

@@ -141,7 +141,7 @@ def whole_session(folder: Path) -> tuple[Rig, MadeSession]:
         )
         return plans[seed]
 
-    names = ("record", "fit", "close_loop", "calibration", "validate")
+    names = ("record", "fit", "close_loop", "account", "calibration", "validate")
     rig.tools = replace(tools, plan=quick_plan, **{name: keep(name) for name in names})
     with serving(rig) as cell_there:
         run_session(rig)
@@ -154,6 +154,7 @@ def whole_session(folder: Path) -> tuple[Rig, MadeSession]:
         recorded=recorded,
         fitted=made["fit"][-1],
         closed=made["close_loop"][-1],
+        changed=made["account"][-1],
         calibration=made["calibration"][-1],
         plans=plans,
         before=before,

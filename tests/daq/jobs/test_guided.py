@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import yaml
 
+from daq.cli import calibrate as calibrate_verb
 from daq.cli.app import main
 from daq.cli.calibrate import Person
 from daq.config.cell import Cell
@@ -1052,6 +1053,19 @@ def test_yes_move_is_for_simulated_cells(
     assert "socketcan" in said
 
 
+@pytest.fixture
+def _quick_planner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The verb plans with 100 exchanges of moves in place of 3000: how good the plan is, is no matter of the table."""
+    tools = calibrate_verb._tools
+
+    def with_quick_plan(*given: Any) -> Tools:
+        quick = partial(plan, exchanges=100, largest_condition=1e6, largest_std_percent=100.0)
+        return replace(tools(*given), plan=quick)
+
+    monkeypatch.setattr(calibrate_verb, "_tools", with_quick_plan)
+
+
+@pytest.mark.usefixtures("_quick_planner")
 def test_check_says_what_is_there_and_what_a_first_session_can_show(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -1071,6 +1085,7 @@ def test_check_says_what_is_there_and_what_a_first_session_can_show(
     assert rig.sessions == ()
 
 
+@pytest.mark.usefixtures("_quick_planner")
 def test_check_of_a_payload_that_the_cell_lacks_is_a_line_of_the_table(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:

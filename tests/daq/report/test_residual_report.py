@@ -32,6 +32,7 @@ from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError, count
 from daq.report import residual_page as residual_page_module
 from daq.report.document import json_text
 from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
+from daq.report.fit import coefficients
 from daq.report.html import html_page, paragraph, table
 from daq.report.plots import draw_fit
 from daq.report.residual import (
@@ -39,8 +40,10 @@ from daq.report.residual import (
     SentenceScreen,
     _effect_sentence,
     _gear_sentence,
+    _hardly_shown_text,
     candidate_rows,
     error_change_text,
+    gains_sentence,
     headline,
     residual_view,
     statistical_sentences,
@@ -74,6 +77,7 @@ from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
+from ident.planning.gain_verdict import Advice, GainSource, GainVerdict, Visibility
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
@@ -575,17 +579,100 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed
 
 def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
     gains = closed.account.total.gains
-    for significant, sentence in (
-        (False, "With and without the effects, the gains are the same within noise."),
+    same = tuple(replace(gain, after=gain.before, significant=False) for gain in gains)
+    marked = (replace(gains[0], significant=True), *same[1:])
+    for shifts, sentence in (
+        (same, "With and without the effects, the gains are the same within noise."),
         (
-            True,
+            marked,
             "The effects change gains by more than noise (probability below 1 % among all axes): "
             f"J1 by {gains[0].change_percent:+.1f} % of the gain without them.",
         ),
     ):
-        marked = (replace(gains[0], significant=significant), *(replace(gain, significant=False) for gain in gains[1:]))
-        changed = replace(closed.account, total=replace(closed.account.total, gains=marked))
+        changed = replace(closed.account, total=replace(closed.account.total, gains=shifts))
         assert sentence in summary(closed.fitted, changed, ())
+
+
+@pytest.mark.parametrize(
+    ("percent", "std_percent", "said"),
+    [
+        (-13.5, 4.3, "the largest difference is -13.5 ± 4.3 % of the gain of J5 without them."),
+        (0.3, 0.1, "the largest difference is +0.30 ± 0.10 % of the gain of J5 without them."),
+        (1.0, 0.8, "the largest difference is +1.00 ± 0.80 % of the gain of J5 without them."),
+        (0.3, 0.2, ""),
+    ],
+    ids=["just missed among six axes", "beyond its own noise", "above the target of the cell", "within noise"],
+)
+def test_a_gain_that_differs_is_not_called_the_same(
+    closed: Closed, percent: float, std_percent: float, said: str
+) -> None:
+    shifts = [replace(gain, after=gain.before, significant=False) for gain in closed.account.total.gains]
+    before = shifts[4].before
+    change_std = 0.01 * std_percent * abs(before)
+    shifts[4] = replace(shifts[4], after=before * (1.0 + 0.01 * percent), change_std=change_std)
+    changed = replace(closed.account, total=replace(closed.account.total, gains=tuple(shifts)))
+    assert closed.fitted.cell.target_sigma_percent == 0.5
+    sentence = gains_sentence(closed.fitted, changed)
+    assert ("the same within noise" in sentence) == (not said)
+    assert sentence.endswith(said)
+
+
+def test_what_the_fit_has_checked_is_taken_up_where_the_effects_explain_it(closed: Closed) -> None:
+    large = Diagnosis("axis-error", (), ("J3",), "an error of 2.1 in 8 Nm (or N), 26.6 %", "3 to 15 %", "look")
+    other = replace(large, axes=("J5",))
+    zero = Diagnosis("zero-turned", (), ("J2",), "the zero of J2 off by about +35 deg", "another", "add it")
+    corrected = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off by +35.0 ± 0.1°", "another", "add it")
+    fitted = replace(closed.fitted, diagnoses_before=(large, other, zero), diagnoses=(other, corrected))
+    (said,) = (one for one in headline(fitted, closed.account, ()) if one.startswith("Without the effects"))
+    assert said.startswith(
+        "Without the effects, the fit said CHECK J3: an error of 2.1 in 8 Nm (or N), 26.6 % (axis-error). With them it "
+        "does not: the error of the current of J3 on held-out runs falls from"
+    )
+
+
+def test_an_estimate_of_the_noise_is_said_where_it_has_no_lower_limit(closed: Closed) -> None:
+    unknown = RelativeError((math.nan,) * 6, math.nan)
+    estimate = RelativeError((math.nan, math.nan, 1.7, math.nan, math.nan, math.nan), math.nan)
+    for floor, said in ((estimate, "(noise leaves 1.7 %, an estimate)."), (unknown, "(noise floor not known).")):
+        judged = replace(closed.account, least_holdout_floor=unknown, least_floor=unknown, holdout_floor=floor)
+        (sentence,) = (one for one in headline(closed.fitted, judged, ()) if one.startswith("J3 has"))
+        assert sentence.endswith(said)
+
+
+def test_a_correction_that_the_error_hardly_shows_has_its_own_sigma_and_the_axis_that_shows_it(
+    closed: Closed,
+) -> None:
+    turn = closed.account.turns[0]
+    assert turn is not None
+    errors = RelativeError((3.2, 2.0, 3.0, 3.0, 3.0, 3.0), 3.12)
+    before = replace(turn.before, holdout=errors)
+    after = replace(turn.after, holdout=RelativeError((3.0, 2.0, 3.0, 3.0, 3.0, 3.0), 3.09))
+    small = replace(turn, before=before, after=after)
+    sentence = _effect_sentence(
+        closed.fitted, closed.account, small, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
+    )
+    assert sentence == (
+        "J2 has a zero that is off: it hardly shows in the error of all axes on held-out runs, 3.12 % without it and "
+        "3.09 % with it; most in that of J1, 3.20 and 3.00 %."
+    )
+    spring = closed.fitted.steps[0].after
+    (size,) = coefficients(spring, SPRING)
+    text = _hardly_shown_text(closed.fitted, SPRING, closed.fitted.steps[0], errors, errors, "here")
+    assert text.startswith(f", by {abs(size.value / size.std):.0f} σ: it hardly shows")
+
+
+def test_the_moves_that_would_help_are_named_after_a_search_too(closed: Closed) -> None:
+    advice = Advice("moves with the payload", 60.0, 0.8)
+    weak = GainVerdict(4, 2.4, None, {GainSource.GRAVITY: 2.4}, True, Visibility.WEAK, advice)
+    sentences = headline(replace(closed.fitted, uncertain=(weak,)), closed.account, ())
+    (said,) = (one for one in sentences if one.startswith("Excitation: J5"))
+    assert "add 60 s of moves with the payload (σ 0.8 %)" in said
+    assert not any(one.startswith("Excitation") for one in headline(closed.fitted, closed.account, ()))
+
+
+def test_the_kind_of_the_errors_is_said_where_several_motors_act_on_a_joint(closed: Closed) -> None:
+    (said,) = (one for one in summary(closed.fitted, closed.account, ()) if "motors' currents" in one)
+    assert said.endswith("differ where several motors act on a joint (J5).")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -985,7 +1072,7 @@ def test_whatever_was_found_a_search_prints_one_screen(
     width: int | None,
 ) -> None:
     together = "All axes together: the error falls."
-    found = Headline(checks, effects, together, judged, refused, ("The gains are the same.",), ending)
+    found = Headline(checks, effects, together, judged, refused, ("The gains are the same.",), (), (), ending)
     shown = [part.text for part in SentenceScreen(found, room).chosen(width)]
     assert together in shown
     lines = sum(1 if width is None else len(break_lines(text, width).split("\n")) for text in shown)

@@ -154,6 +154,21 @@ def test_positions_outside_the_limits_are_reported_in_mm() -> None:
     assert "mm were taken for m" in text
 
 
+@pytest.mark.parametrize(
+    ("ends_m", "said"),
+    [((0.7, 1.1), "most likely the zero is wrong: moved by -745 to -155 mm"), ((0.0, 1.1), "mm were taken for m")],
+    ids=["as many as the axis can make", "more"],
+)
+def test_positions_that_another_zero_brings_within_the_limits_are_not_blamed_on_units(
+    ends_m: tuple[float, float], said: str
+) -> None:
+    position = np.full((10, 5), 0.2)
+    position[:, 1] = np.linspace(*ends_m, 10)
+    with pytest.raises(PositionImplausible) as caught:
+        check_limits("log", position, GANTRY)
+    assert said in str(caught.value)
+
+
 def test_one_start_a_joint(tmp_path: Path) -> None:
     for name in ("gantry.yaml", "gantry-plant.urdf"):
         shutil.copyfile(CHECKOUT / "configs/simulation" / name, tmp_path / name)

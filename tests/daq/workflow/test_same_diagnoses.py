@@ -15,22 +15,25 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from daq.cli.app import main
 from daq.cli.next_step import say_after_fit
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
+from daq.errors import ExitCode
 from daq.log.reader import LossyLogs
 from daq.report.certificate import certify
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import without_controller
 from daq.report.validation import validation_view
+from daq.workflow import diagnoses as diagnoses_module
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.diagnoses import hidden_zeros_text
+from daq.workflow.diagnoses import geometry_beside, geometry_refusal, hidden_zeros_text
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
-from daq.workflow.validate import cross_validate
+from daq.workflow.validate import cross_validate, replaced_geometry
 from daq.writeback.gates.fit import uncorrected_description
-from ident.data.run import Run
+from ident.data.run import Recording, Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.geometry_check import AlikeCorrections, GeometryCheck
 from ident.discovery.joining import SetAside
@@ -39,12 +42,13 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import LatePosition, ZeroOffset
 from ident.errors import Diagnosis, IdentificationError
-from ident.estimators.turned_geometry import with_gravity
+from ident.estimators.turned_geometry import find_turned_geometry, with_gravity
 from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
 from tests.ident.findings import passed_finding
 from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, record, three_axes_truth
+from tests.remembered import remembered
 
 WHEN = datetime(2025, 1, 2, tzinfo=UTC)
 CELL = """\
@@ -65,6 +69,7 @@ conditioning:
   {position_cutoff_hz: 40.0, position_order: 4, decimation_cutoff_hz: 20.0, standstill_rad_s: [0.03, 0.03, 0.03]}
 """
 
+SECTION = "axes.zero_offset (J2)"  #: That a given description changes
 RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
 FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
 FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
@@ -223,6 +228,11 @@ def said(diagnoses: tuple[Diagnosis, ...]) -> set[str]:
     return {" ".join((one.name, *one.runs, *one.axes)) for one in diagnoses}
 
 
+def refuse_to_weigh() -> None:
+    """Weigh no payload."""
+    raise IdentificationError("no mass is asked for")
+
+
 def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
     return sorted(one.text for one in diagnoses)
 
@@ -240,6 +250,13 @@ def test_the_same_is_said_by_every_verb(
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", load)
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    # Every verb asks for these itself; what is asked with the same arguments again is not computed again.
+    turned_geometry = remembered(find_turned_geometry)
+    for asking in (diagnoses_module, validate_module):
+        monkeypatch.setattr(asking, "find_turned_geometry", turned_geometry)
+    monkeypatch.setattr(fit_module, "geometry_beside", remembered(geometry_beside))
+    # The masses of a validation say nothing of a diagnosis.
+    monkeypatch.setattr(validate_module, "rows_to_weigh", lambda *_, **__: refuse_to_weigh())
     paths = [Path(f"r{number}") for number in range(RUNS)]
     logs, holdout = paths[:USED], paths[USED:]
     verbs: dict[str, Callable[[], tuple[Diagnosis, ...]]] = {
@@ -293,6 +310,30 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     console.print(*validation_view(calibration, cross_validate({"one": calibration}, paths[USED:])))
     said_of_fit = "The fit of this calibration found: CHECK J2" in screen.getvalue()
     assert said_of_fit == bool(degrees)
+
+
+def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load(
+    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It explains a small part of what a run without load leaves, and was not named."""
+    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    calibration = calibration_of(fit([Path(f"r{number}") for number in range(USED)]), WHEN)
+    given = Recording(None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,))
+    noise_a = 0.06 * np.random.default_rng(1).standard_normal(recorded[6].current_a.shape)
+    moved = replace(offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given)
+    other = replace(cell, digest="other", recording_digest="other")
+    found: dict[str, set[str]] = {}
+    for name, run in {"given": moved, "recorded": replace(moved, recording=None)}.items():
+        monkeypatch.setattr(validate_module, "load_run", lambda *_, run=run: (run, other))
+        diagnoses = cross_validate({"one": calibration}, [Path("r6")], other).diagnoses
+        found[name] = said(diagnoses)
+        if name == "given":
+            assert "the given cell file has another number here" in diagnoses[0].remedy
+    assert found == {"given": {"zero-off r6 J2"}, "recorded": set()}
+    # A calibration of the same description predicts in the same geometry.
+    made_with_it = replace(calibration, recording_configuration_sha256=other.recording_digest)
+    assert replaced_geometry(made_with_it, moved, other) == ()
 
 
 def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
@@ -374,6 +415,42 @@ def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
     assert (found.name, found.axes) == ("zero-off", ("J2",))
     number, deviation = re.findall(r"([-+]\d+\.\d+) ± (\d+\.\d+)", found.found)[0]
     assert abs(float(number) + 35.0) < 4.0 * float(deviation) < 2.0
+
+
+@pytest.mark.parametrize("json", [False, True])
+@pytest.mark.parametrize("verb", ["fit", "residual"])
+def test_gains_that_mean_nothing_are_refused(
+    cell: Cell,
+    recorded: Runs,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    verb: str,
+    json: bool,
+) -> None:
+    """They ended with exit code 0, beside a CHECK that said so."""
+    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in map(reversed_position, recorded)}
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    out = tmp_path / "calibration.yaml"
+    command = [verb, *(f"r{number}" for number in range(USED)), "--out", str(out)]
+    assert main([*command, *(["--json"] if json else [])]) == ExitCode.DATA_UNFIT
+    text, said_on_stderr = capsys.readouterr()
+    assert "a position that counts the other way" in said_on_stderr
+    assert "gains and errors mean nothing until it is right" in said_on_stderr
+    assert "Next:" not in said_on_stderr
+    assert not out.exists()
+    assert ('"diagnoses"' in text) == json
+    if verb == "fit" and not json:
+        assert text == ""
+
+
+def test_what_is_said_of_another_run_leaves_the_gains_as_they_are() -> None:
+    of_run = Diagnosis("position-reversed", ("held-out",), ("J2",), "a position", "another", "reverse it")
+    assert geometry_refusal((of_run,)) is None
+    refused = geometry_refusal((of_run, replace(of_run, runs=())))
+    assert refused is not None
+    assert str(refused).startswith("J2")
 
 
 def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_to_be_typed_in(

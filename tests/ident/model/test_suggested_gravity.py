@@ -1,0 +1,27 @@
+"""A gravity that is to be typed in has no digits of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.model.suggested_gravity import suggested_gravity
+
+
+@pytest.mark.parametrize(
+    ("found", "std_deg", "expected"),
+    [
+        ([0.003, -0.012, -9.81], 0.1, [0.0, 0.0, -9.81]),
+        ([-0.001, 0.002, -9.808], 0.02, [0.0, 0.0, -9.808]),
+        ([0.0, 9.8066, 0.001], 0.1, [0.0, 9.8066, 0.0]),
+        ([0.3423, 0.0021, -9.8041], 0.02, [0.342, 0.0, -9.804]),
+        ([0.3423, 0.0321, -9.8041], 0.02, [0.342, 0.032, -9.804]),
+        ([0.3423, 0.0321, -9.8041], 0.2, [0.34, 0.0, -9.8]),
+        ([0.1, 0.2, -9.8], 40.0, [0.0, 0.0, -9.8026]),
+        ([0.1, 0.2, -9.8], 0.0, [0.1, 0.2, -9.8]),
+    ],
+)
+def test_digits_of_noise_are_left_out(found: list[float], std_deg: float, expected: list[float]) -> None:
+    suggested = suggested_gravity(np.array(found), float(np.radians(std_deg)))
+    assert suggested.tolist() == pytest.approx(expected, abs=1.5e-4)
+    assert not np.any(np.signbit(suggested[suggested == 0.0]))
