@@ -81,7 +81,9 @@ def geometry_drift(
     payload_nm = np.empty((0, *left_nm.shape))
     if data.payload is not None:
         payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
-    nuisance = _nuisance(signals.geared_torque_nm, signals.velocity_rad_s, payload_nm)
+    # Of a closed chain the signals have the joints without a motor, too, behind those of the axes.
+    velocity = signals.velocity_rad_s[: len(left_nm)]
+    nuisance = _nuisance(signals.geared_torque_nm, velocity, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
     torque_nm = model.drive_train.direction.T @ signals.motor_torque_nm
     usual_nm = _usual_error_nm(calibration, torque_nm, use)

@@ -19,9 +19,12 @@ from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset, rotation_by
 from ident.equations.rows import decimate_rows, row_masks
 from ident.estimators.estimate import RelativeError
+from ident.estimators.identify import identify
 from ident.geometry_drift import GeometryDrift, geometry_drift
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque
+from tests.ident.closed_recordings import recorded
+from tests.ident.mechanisms import FIVE_BAR
 from tests.ident.recordings import MOUNTED, gathered, record, tx40_truth
 
 FloatArray = NDArray[np.float64]
@@ -138,3 +141,18 @@ def test_nothing_is_named_where_friction_or_a_gain_has_changed() -> None:
     current[:, 1] += 4.0 * np.sign(np.gradient(run.position_rad[:, 1])) / truth.gains[1]
     current[:, 2] *= 1.2
     assert _drift(replace(run, current_a=current), truth.model) is None
+
+
+@pytest.mark.parametrize("run", [0, 1], ids=["bare", "loaded"])
+def test_a_run_of_a_closed_chain_is_judged_as_well(run: int) -> None:
+    made = recorded(FIVE_BAR, noise_a=0.02)
+    identified = identify(made.model, made.runs, made.conditioning)
+    calibration = calibration_of(identified, AXES[:2], FIVE_BAR.gains)
+    data = differentiate(made.runs[run], made.model.drive_train, made.conditioning)
+    use, _ = row_masks(made.model, data, made.conditioning)
+    left = measured_torque(calibration, made.model, data.current_a) - predict_torque(calibration, made.model, data)
+    # An error that the fit did not leave is worth a look.
+    left = left + 0.3 * np.sin(3.0 * data.position_rad)
+    left_nm = decimate_rows(data, made.conditioning, left.T)
+    # No change of one number of the geometry explains it.
+    assert geometry_drift(calibration, made.model, data, made.conditioning, left_nm, use) is None
