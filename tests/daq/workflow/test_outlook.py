@@ -140,6 +140,26 @@ def test_the_next_moves_stay_inside_what_was_accepted(
             assert move.acceleration <= max(other.acceleration for first in accepted for other in first.moves)
 
 
+def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> None:
+    """The second link of this arm touches the lower end of its reach in all postures."""
+    experiment = experiment_of(load_cell(CELLS / "seven-axis.yaml"))
+    accepted = plan(
+        experiment.cell,
+        seed=100,
+        duration_s=10.0,
+        exchanges=0,
+        largest_condition=np.inf,
+        largest_std_percent=np.inf,
+        experiment=experiment,
+    )
+    room = accepted_room(experiment.cell, experiment.scene, (accepted,))
+    inside = room.scene(experiment.scene).checker
+    targets = np.array([move.target_rad for move in accepted.moves])
+    assert (inside.margins(targets) > 0.0).all()
+    random = np.random.default_rng(1).uniform(room.box.lower, room.box.upper, (200, len(targets[0])))
+    assert np.mean(inside.margins(random) > 0.0) > 0.3
+
+
 def test_a_declared_workspace_is_the_room_without_a_second_one(
     experiment: Experiment, accepted: tuple[Plan, ...]
 ) -> None:
