@@ -88,7 +88,7 @@ class RobotRow:
     robot: str
     seeds: int
     motion_s: float  #: median
-    changes: str  #: least to most
+    changes: str  #: least to most, of those that ended without an error
     step_by_step_s: float  #: median
     ratio: float  #: median
     worst_ratio: float
@@ -100,7 +100,8 @@ class RobotRow:
 def robot_row(name: str, own: Sequence[dict[str, Any]]) -> RobotRow:
     """The units of a robot, or of all."""
     rows = [row_of(unit) for unit in own]
-    changed = [row.changes for row in rows]
+    ended = [row for row in rows if np.isfinite(row.motion_s)]
+    changed = [row.changes for row in ended] or [0]
     ratios = [row.ratio for row in rows]
     return RobotRow(
         robot=name,
@@ -112,7 +113,7 @@ def robot_row(name: str, own: Sequence[dict[str, Any]]) -> RobotRow:
         worst_ratio=max(ratios),
         targets_missed=sum(row.target_missed for row in rows),
         rms_z=_rms(_z(own)),
-        worst_error_percent=max(row.worst_error_percent for row in rows),
+        worst_error_percent=max((row.worst_error_percent for row in ended), default=float("nan")),
     )
 
 

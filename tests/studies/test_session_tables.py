@@ -48,6 +48,9 @@ def test_a_way_that_failed_is_missed_with_its_reason() -> None:
     assert [one.robot for one in all_rows] == ["RX-90", "all"]
     assert all_rows[0].targets_missed == 1
     assert all_rows[0].rms_z == pytest.approx(math.sqrt(2.5))
+    # What did not end has no changes and no errors.
+    assert all_rows[0].changes == "1 to 1"
+    assert all_rows[0].worst_error_percent == pytest.approx(0.8)
     assert "RX-90-2: IdentificationError: J2 tripped" in summary([_unit(failed, STEPS, 2)])
 
 
