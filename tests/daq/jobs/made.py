@@ -129,6 +129,4 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         rig.job()
         assert powerless(cell_there)
     logs = {name: rig.session.folder / f"{name}.mcap" for name in recorded}
-    return rig, Made(
-        plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["account"], kept["calibration"]
-    )
+    return rig, Made(plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["account"], kept["calibration"])
