@@ -12,12 +12,12 @@ from daq.workflow.experiment import CheckedScene, paths_of
 from daq.workflow.plan import Plan, TargetBox
 from ident.arrays import FloatArray
 from ident.model.robot import poses
-from ident.planning.clearance import BASE, Box, Checker
+from ident.planning.clearance import BASE, RESOLUTION_M, Box, Checker
 
 STEPS = 50  #: Postures on each way whose extent is taken
-ROUNDING_M = 1e-4
-"""How far moves may leave the extent of those that were accepted [m]: by the rounding of a plan file. A part that only
-turns at one height is at the end of this extent in all postures, and rounding would leave it no posture at all."""
+SLACK_M = RESOLUTION_M + 0.001
+"""How far moves may leave the extent of those that were accepted [m]. A part that only turns at one height is at its
+end in all postures. Without room for rounding and for the resolution of the check, no way would be clear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,8 +43,8 @@ class AcceptedRoom:
         if self.reach is None:
             return scene
         capsules = scene.checker.scene.capsules
-        lower_m = _corner(self.reach.lower_m - ROUNDING_M)
-        upper_m = _corner(self.reach.upper_m + ROUNDING_M)
+        lower_m = _corner(self.reach.lower_m - SLACK_M)
+        upper_m = _corner(self.reach.upper_m + SLACK_M)
         bounded = replace(
             scene.checker.scene,
             workspace=Box("the reach of the moves that were accepted", lower_m, upper_m),
