@@ -83,7 +83,9 @@ def in_one(number: int, change: Callable[[Run], Run]) -> Mistake:
 
 def carrying(body: np.ndarray) -> Mistake:
     """Another body than the payload in the second loaded run."""
-    return lambda runs: [*runs[:3], small_recordings(three_axes_truth(), 0, count=RUNS, seconds=SECONDS, bodies={3: body})[3], *runs[4:]]
+    truth = three_axes_truth()
+    carried = small_recordings(truth, 0, count=RUNS, seconds=SECONDS, bodies={3: body})[3]
+    return in_one(3, lambda _: carried)
 
 
 def scaled(*factors: float) -> Mistake:
