@@ -118,6 +118,7 @@ def _searched(mistake: Mistake) -> tuple[Step, ...]:
     return find_effects(_fitted(mistake), np.random.default_rng(0), GATES)
 
 
+@cache
 def _checked(mistake: Mistake) -> GeometryCheck:
     return check_geometry(_fitted(mistake), np.random.default_rng(0), GATES)
 

@@ -30,8 +30,7 @@ NOISE_RAD = 5e-6  #: of a count of 2⁻¹⁶ turns of a motor behind a gear of 5
 PARAMETERS = geometry_parameters(PLANAR.robot)
 X_OF_FIRST = GeometryParameter(GeometryKind.PLACE, "motor-0", "x")
 Y_OF_SECOND = GeometryParameter(GeometryKind.PLACE, "motor-1", "y")
-SECONDS = 12.0
-DRAWN = 2000  #: Samples of a shorter run, where many are drawn
+SECONDS = 8.0
 DRAWS = 12
 COUNT_RAD = 2.0 * np.pi / (65536 * 5)
 
@@ -163,7 +162,7 @@ def test_deviations_are_those_of_the_noise(correlation_s: float) -> None:
     """
     scaled: list[float] = []
     for draw in range(DRAWS):
-        exact = _exact(1 + draw % 3)[:DRAWN]
+        exact = _exact(1 + draw % 3)
         noise = NOISE_RAD * _noise(draw, exact.shape, correlation_s)
         found = _found(position_rad=exact + noise)
         assert not found.is_significant
