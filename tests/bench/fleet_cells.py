@@ -37,6 +37,7 @@ PLAN_SETS = 4
 RUNS = (("bare", False), ("loaded", True), ("held-out", True))
 """Runs of a session, in the order in which they are made."""
 START_NS = 1_750_000_000_000_000_000
+PERIOD_US = 1000  #: Of the demonstration's cell
 BETWEEN_NS = 120_000_000_000
 ENABLED = 0x1237
 """Statusword of an axis that moves, CiA 402."""
@@ -51,12 +52,14 @@ class FleetCell:
         number: from 0; it decides all that is the cell's own.
         plans: of its runs.
         runs: how many of RUNS it has.
+        period_us: between two samples.
     """
 
     folder: Path
     number: int
     plans: tuple[Plan, ...]
     runs: int = len(RUNS)
+    period_us: int = PERIOD_US
 
     @property
     def name(self) -> str:
@@ -102,6 +105,8 @@ def make_cell(made: FleetCell) -> str:
         log.with_name(log.name + ".part").unlink(missing_ok=True)
         payload = Payload("disc", "flange-a", {"m": mass_kg}) if loaded else None
         spec = spec_of(truth, "disc" if loaded else None, number)
+        steps = spec.substeps * made.period_us // spec.sync_period_us
+        spec = replace(spec, sync_period_us=made.period_us, substeps=steps)
         raw = simulate_run(cell, spec, made.plans[number], name, payload)
         write_log(log, raw, cell, files, START_NS + number * BETWEEN_NS)
     part.rename(target)
@@ -111,6 +116,7 @@ def make_cell(made: FleetCell) -> str:
 def _own_file(text: str, made: FleetCell, mass_kg: float) -> str:
     """The demonstration's cell file with a name, serial numbers and a payload of its own."""
     text = re.sub(r"^name: demo$", f"name: {made.name}", text, flags=re.MULTILINE)
+    text = re.sub(rf"^  period_us: {PERIOD_US}$", f"  period_us: {made.period_us}", text, flags=re.MULTILINE)
     text = re.sub(r"serial: 100(\d)", rf"serial: {10 + made.number}0\1", text)
     return re.sub(r"mass_kg: 4\.59$", f"mass_kg: {mass_kg}", text, flags=re.MULTILINE)
 

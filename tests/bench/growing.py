@@ -34,7 +34,14 @@ def _runs() -> list[Run]:
     for number in range(RUNS):
         payload = MOUNTED if number % 4 in (1, 2) else None
         run = record(
-            tx40_truth(), f"run {number}", rng, payload, seconds=MOVES * MOVE_S, noise_a=NOISE_A, rate_hz=RATE_HZ
+            tx40_truth(),
+            f"run {number}",
+            rng,
+            payload,
+            seconds=MOVES * MOVE_S,
+            noise_a=NOISE_A,
+            rate_hz=RATE_HZ,
+            averaged=1,
         )
         move = (run.time_s // MOVE_S).astype(np.int64)
         runs.append(replace(run, move=move))

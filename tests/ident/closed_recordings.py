@@ -68,7 +68,7 @@ def recorded(
     mechanism: Mechanism,
     seed: int = 4,
     *,
-    seconds: float = 15.0,
+    seconds: float = 10.0,
     noise_a: float = 0.0,
     preload_nm: float = 0.3,
     share: float = 1.0,

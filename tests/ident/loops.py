@@ -17,6 +17,7 @@ from tests.ident.recordings import PAYLOAD_TRUTH, Truth, record
 FloatArray = NDArray[np.float64]
 LOOP_HZ, DAMPING = 4.0, 0.7  #: of each joint's closed position loop
 CORRELATION_S = 0.02  #: of the disturbance
+AVERAGED = 4  #: Samples of 1 kHz that become one
 INERTIA_KG_M2 = 0.5  #: that the disturbance moves, the same at every joint
 
 
@@ -31,9 +32,10 @@ def record_in_loop(
 ) -> Run:
     """One run: I δq̈ + 2 D ω I δq̇ + ω² I δq = −d moves every joint off its demand, and g v = τ(q + δq) + d.
 
-    The currents obey the declared model for the recorded motion, with the error d; but that motion has seen d.
+    The currents obey the declared model for the recorded motion, with the error d; but that motion has seen d. It is
+    made at 1 kHz, and each sample of the run is the mean of four.
     """
-    asked = record(truth, name, rng, payload, seconds=seconds)
+    asked = record(truth, name, rng, payload, seconds=seconds, averaged=1)
     rate_hz, count = asked.rate_hz, len(truth.gains)
     memory = np.exp(-1.0 / (rate_hz * CORRELATION_S))
     white = rng.standard_normal((len(asked.time_s), count)) * disturbance_nm * np.sqrt(1.0 - memory**2)
@@ -53,4 +55,6 @@ def record_in_loop(
     torque = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters) + disturbance[1:-1].T
     current = np.zeros_like(q)
     current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
-    return replace(asked, position_rad=q, current_a=current)
+    samples = len(q) // AVERAGED * AVERAGED
+    q, current = (one[:samples].reshape(-1, AVERAGED, count).mean(axis=1) for one in (q, current))
+    return replace(asked, time_s=asked.time_s[:samples:AVERAGED], position_rad=q, current_a=current)

@@ -136,12 +136,30 @@ def record(
     seconds: float = 20.0,
     noise_a: float = 0.0,
     rate_hz: float = 1000.0,
+    averaged: int | None = None,
     bend: Callable[[FloatArray], FloatArray] = lambda q: q,
 ) -> Run:
-    """One run: the current is what the model needs for the (bent) motion, plus noise on the current alone."""
+    """One run: the current is what the model needs for the (bent) motion, plus noise on the current alone.
+
+    Args:
+        truth: the robot.
+        name: of the run.
+        rng: of moves and noise.
+        payload: that it carries.
+        seconds: duration.
+        noise_a: σ of each sample that is drawn [A].
+        rate_hz: of the samples that are drawn.
+        averaged: how many of them become one sample of the run; where None, 4 of 1 kHz, else 1. Fewer tell the filters
+            of a fit, which end at some 10 Hz, the same, and are worked on in a quarter of the time.
+        bend: the motion that is made, of the positions that are drawn.
+    """
+    drawn_hz = rate_hz
+    averaged = averaged or (4 if drawn_hz == 1000.0 else 1)
+    rate_hz = drawn_hz / averaged
     count = len(truth.gains)
     limits = np.array([2.5, 1.8, 2.2, 3.0, 1.8, 3.0, 2.0][:count])
-    q = bend(positions(rng, seconds, rate_hz, limits))
+    drawn = bend(positions(rng, seconds, drawn_hz, limits))
+    q = drawn[::averaged]
     time = np.arange(len(q)) / rate_hz
     bare = Run(name, time, q, np.zeros_like(q))
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the motion's own.
@@ -153,7 +171,8 @@ def record(
     torque = np.einsum("jck,c->jk", columns, parameters)
     current = np.zeros_like(q)
     current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
-    current += noise_a * rng.standard_normal(current.shape)
+    noise = noise_a * rng.standard_normal(drawn.shape)
+    current += np.add.reduceat(noise, np.arange(0, len(noise), averaged)) / averaged
     return Run(name, time, q, current, payload)
 
 

@@ -18,12 +18,12 @@ from ident.prediction import placed_effect
 from tests.ident.recordings import Truth
 
 AXES, NAMEPLATE = ("J1", "J2", "J3"), (32.0, 34.0, -23.0)
-DELAY_S = 0.006
+DELAY_S = 0.008
 
 
 @pytest.fixture(scope="module")
 def late(small_runs: tuple[ident.Run, ...]) -> tuple[ident.Run, ...]:
-    """Recordings whose currents were sampled six milliseconds after their positions."""
+    """Recordings whose currents were sampled eight milliseconds after their positions."""
     samples = round(DELAY_S * small_runs[0].rate_hz)
     return tuple(
         replace(

@@ -35,14 +35,16 @@ NOISE_A = 0.05
 
 @cache
 def _new_run() -> Run:
-    return record(tx40_truth(), "new", np.random.default_rng(77), seconds=30.0, rate_hz=500.0, noise_a=NOISE_A)
+    return record(
+        tx40_truth(), "new", np.random.default_rng(77), seconds=30.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A
+    )
 
 
 @cache
 def _fitted_runs() -> tuple[Run, ...]:
     rng = np.random.default_rng(5)
     return tuple(
-        record(tx40_truth(), f"run {number}", rng, payload, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A)
+        record(tx40_truth(), f"run {number}", rng, payload, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A)
         for number, payload in enumerate((None, MOUNTED))
     )
 

@@ -32,7 +32,7 @@ lax: Any = ident  #: As a notebook sees it
 OF_A_RUN: list[tuple[str, Change, str]] = [
     ("time of two columns", lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)), r"'bare': time_s .*\(n_samples,\)"),
     ("a rate for the time", lambda r: replace(r, time_s=0.001), r"'bare': time_s has shape \(\); expected"),
-    ("a gap in time", lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)), "time_s holds 1 .* sample 19999;"),
+    ("a gap in time", lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)), "time_s holds 1 .* sample 4999;"),
     (
         "ragged time",
         lambda r: replace(r, time_s=[[0.0], [0.1, 0.2]]),

@@ -52,7 +52,7 @@ def session(seed: int) -> dict[str, Run]:
     truth, rng = tx40_truth(), np.random.default_rng(seed)
     mounted = {name: None if name.startswith("bare") else MOUNTED for name in (*FIT, HELD_OUT)}
     return {
-        name: _sticking(record(truth, name, rng, payload, noise_a=0.3, seconds=22.0))
+        name: _sticking(record(truth, name, rng, payload, noise_a=0.3, seconds=22.0, averaged=1))
         for name, payload in mounted.items()
     }
 

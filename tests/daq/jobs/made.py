@@ -103,7 +103,7 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         folder: of the cell; empty, the plan goes beside it.
     """
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    plan_file = make_plan(cell, folder.parent / "plan.yaml", seed=10, duration_s=6.0, moves=4)
+    plan_file = make_plan(cell, folder.parent / "plan.yaml", seed=11, duration_s=6.0, moves=4)
     rig = make_rig(folder, plan_file)
     kept: dict[str, Any] = {}
     recorded: dict[str, Recorded] = {}

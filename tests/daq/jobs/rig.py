@@ -37,6 +37,8 @@ from drivers.simulation.faults import FaultSpec
 from drivers.simulation.spec import CellSpec, ToggleBit
 
 BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
+PERIOD_US = 2000
+"""Of the cells here, in place of a millisecond: half as many frames say the same of a job."""
 WHO = "the test's job"
 RUNS: tuple[dict[str, Any], ...] = (
     {"name": "bare-1"},
@@ -52,7 +54,14 @@ def _cell(path: Path, _content: bytes) -> Cell:
 
 @cache
 def _truth(payload: str | None) -> CellSpec:
-    return load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload)
+    return _with_period(load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload))
+
+
+def _with_period(truth: CellSpec) -> CellSpec:
+    """The same at PERIOD_US, in steps of the same time, and with noise that filters leave as much of."""
+    slower = PERIOD_US / truth.sync_period_us
+    axes = (replace(axis, current_noise_a=axis.current_noise_a / slower**0.5) for axis in truth.axes)
+    return replace(truth, sync_period_us=PERIOD_US, substeps=round(slower * truth.substeps), axes=tuple(axes))
 
 
 class TestClock:
@@ -155,6 +164,7 @@ def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = N
     (folder / "cells").mkdir()
     document = yaml.safe_load((shipped / "cells" / "demo.yaml").read_text(encoding="utf-8"))
     document["bus"]["channel"] = f"recalibration {folder.parent.name} {folder.name}"
+    document["sync"]["period_us"] = PERIOD_US
     document["policy"] = policy or {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
     document["recalibration"] = {
         "runs": [{"plan_file": str(plan_file), **run} for run in RUNS],
@@ -189,7 +199,7 @@ def serving(
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
     mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
-    truth = replace(spec or mounted.at_power_on(), faults=faults, seed=seed)
+    truth = replace(mounted.at_power_on() if spec is None else _with_period(spec), faults=faults, seed=seed)
     truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
     bus = open_bus(bus_address(rig.cell))
     try:

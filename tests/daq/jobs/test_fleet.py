@@ -47,11 +47,11 @@ CREATED = datetime(2025, 1, 2, tzinfo=UTC)
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Short logs of simulated cells; to make them takes most of the time here."""
+    """Short logs of simulated cells at 250 Hz; to make them takes most of the time here."""
     folder = tmp_path_factory.mktemp("fleet")
     (plans,) = plans_of(1, exchanges=40, duration_s=5.5)
     for number in range(CELLS):
-        make_cell(FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2))
+        make_cell(FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000))
     return folder
 
 

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
@@ -127,7 +128,9 @@ def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, ma
     acceptance = state_of(rig).acceptance
     assert acceptance is not None
     assert not acceptance.accepted
-    assert "J4 +25" in acceptance.remark
+    told = re.search(r"J4 \+(\d+\.\d) ", acceptance.remark)  # its nameplate is 25.2 % too large
+    assert told is not None
+    assert float(told[1]) == pytest.approx(25.2, abs=1.5)
     summary = (rig.session.folder / "summary.txt").read_text()
     assert "NOT ACCEPTED" in summary
     undo = f"drivegain rollback {rig.cell_file}"

@@ -29,7 +29,7 @@ from tests.daq.killing import in_a_child
 
 pytestmark = pytest.mark.processes
 
-OF_GUIDED_SESSIONS = {"preview", "look", "validate", "network"}  #: Tools that a job does not call
+OF_GUIDED_SESSIONS = {"preview", "look", "validate", "network", "geometry"}  #: Tools that a job does not call
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"} | OF_GUIDED_SESSIONS)
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 

@@ -41,6 +41,7 @@ def cell_process(rig: Rig) -> Iterator[None]:
             document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
             document["bus"] |= {"interface": "socketcand", "channel": "can0", "port": int(found[1])}
             document["bus"] |= {"host": "127.0.0.1"}
+            document["sync"]["period_us"] = 1000  # of the shipped simulation
             rig.cell_file.write_text(json.dumps(document), encoding="utf-8")
             yield
         finally:

@@ -29,7 +29,7 @@ from tests.daq.jobs.made_session import MadeSession, run_session, session_rig
 from tests.daq.jobs.rig import Rig
 from tests.daq.killing import in_a_child
 
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network"})
+CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network", "geometry"})
 """Tools whose calls are the moments from which a kill is drawn: they are in every stage."""
 INTERLOCK = {"command": ["sh", "-c", "echo interlock >> events && test -e closed"]}
 """An interlock that releases the robot and leaves a line."""

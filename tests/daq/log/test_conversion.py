@@ -182,7 +182,9 @@ def test_an_invalid_run_is_refused(record: Recorder) -> None:
 
 def test_positions_outside_the_limits_are_refused(record: Recorder) -> None:
     turned = round(65536 * 32 * 0.8)
-    with pytest.raises(PositionImplausible, match=r"axis J1: found joint positions from 0 to 288 deg; .*radians"):
+    with pytest.raises(
+        PositionImplausible, match=r"axis J1: found joint positions from 0 to 288 deg; .*the zero is wrong.*units"
+    ):
         load_run(record(samples([[0] * 6, [turned, 0, 0, 0, 0, 0]])))
 
 

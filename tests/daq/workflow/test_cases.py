@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,15 +82,21 @@ def reduced(shelf: Shelf) -> ReducedLogs:
 
 
 @pytest.fixture(scope="module")
-def calibrations(reduced: ReducedLogs, shelf: Shelf) -> dict[str, Calibration]:
-    """One a case."""
-    found = {}
-    with pytest.MonkeyPatch.context() as patch:
+def written(shelf: Shelf, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of all cases as the command writes it, and what it prints."""
+    folder = tmp_path_factory.mktemp("written") / "cases"
+    logs = ["bare1", "disc1", "bare2", "disc2", "--holdout", "disc3"]
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
         patch.setattr(fit_module, "load_run", shelf.load)
-        for case in CASES:
-            fitted = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=20.0)
-            found[case.name] = calibration_of_case(fitted, CREATED)
-    return found
+        assert main(["fit", *logs, "--cases", str(folder), "--essential", "20", "--json"]) == 0
+    return folder, json.loads(printed.getvalue())
+
+
+@pytest.fixture(scope="module")
+def calibrations(written: tuple[Path, dict[str, Any]]) -> dict[str, Calibration]:
+    """One a case."""
+    return {case.name: load_calibration(written[0] / f"{case.name}.yaml") for case in CASES}
 
 
 def _paths(*names: str) -> list[Path]:
@@ -270,11 +279,11 @@ def test_the_tables_have_the_papers_form(calibrations: dict[str, Calibration], f
         assert table.markdown().count("\n| ") == len(table.rows) + 2
 
 
-def test_the_command_line_writes_cases_and_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "cases"
+def test_the_command_line_writes_cases_and_tables(
+    written: tuple[Path, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, printed = written
     logs = ["bare1", "disc1", "bare2", "disc2"]
-    assert main(["fit", *logs, "--cases", str(folder), "--essential", "20", "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
     assert set(printed["cases"]) == {case.name for case in CASES}
     assert printed["cases"]["case-2"]["removed"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(

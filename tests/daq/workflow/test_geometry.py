@@ -50,10 +50,10 @@ RATE_HZ, COUNT_RAD = 250.0, 2.0 * np.pi / (65536 * 5)
 
 
 def _positions(seed: int) -> FloatArray:
-    """Positions of the motors, 12 s, that the closures allow: the poses that fit a smooth motion best."""
+    """Positions of the motors, 9 s, that the closures allow: the poses that fit a smooth motion best."""
     model = model_of(CELL)
     rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, 12.0, 1.0 / RATE_HZ)[:, None, None]
+    time_s = np.arange(0.0, 9.0, 1.0 / RATE_HZ)[:, None, None]
     frequency_hz = rng.uniform(0.2, 1.4, (4, 5))
     phase = rng.uniform(0.0, 2.0 * np.pi, (4, 5))
     wished = 0.06 * np.sum(np.sin(2.0 * np.pi * frequency_hz * time_s + phase), axis=2)

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
 POOR = 3  #: Axis J4, which rests in all moves so far
 BLOCKS = 14
-SEEDS = (1, 2, 3, 4, 5, 6)
+SEEDS = (1, 2, 3, 4)
 
 
 @pytest.fixture(scope="module")
@@ -73,20 +73,27 @@ def resting(experiment: Experiment) -> Plan:
 
 
 @pytest.fixture(scope="module")
+def next_plans(experiment: Experiment, poor: FloatArray) -> dict[int, Plan]:
+    """Plans on top of those blocks, by their seeds; every gain has the same target."""
+    return {seed: _made(experiment, seed, goal=PlanGoal(poor, np.ones(6))) for seed in SEEDS}
+
+
+@pytest.fixture(scope="module")
 def poor(experiment: Experiment, resting: Plan) -> FloatArray:
     """Information of several blocks of them."""
     return BLOCKS * _information(experiment, resting)
 
 
-def test_the_next_moves_are_for_the_gain_that_is_worst_so_far(experiment: Experiment, poor: FloatArray) -> None:
+def test_the_next_moves_are_for_the_gain_that_is_worst_so_far(
+    experiment: Experiment, poor: FloatArray, next_plans: dict[int, Plan]
+) -> None:
     """Against a plan of the same seed and length that knows nothing of the blocks before."""
     design = experiment.design
     before = design.std_percent(poor)
     assert np.isinf(before[POOR])
     assert np.delete(before, POOR).max() < 1.0
     ratios = []
-    for seed in SEEDS:
-        next_plan = _made(experiment, seed, goal=PlanGoal(poor, np.ones(6)))
+    for seed, next_plan in next_plans.items():
         first_plan = _made(experiment, seed)
         with_goal = design.std_percent(poor + _information(experiment, next_plan))
         without = design.std_percent(poor + _information(experiment, first_plan))
@@ -97,15 +104,16 @@ def test_the_next_moves_are_for_the_gain_that_is_worst_so_far(experiment: Experi
     assert np.mean(ratios) < 0.93
 
 
-def test_a_stricter_target_draws_the_moves_to_its_gain(experiment: Experiment, poor: FloatArray) -> None:
+def test_a_stricter_target_draws_the_moves_to_its_gain(
+    experiment: Experiment, poor: FloatArray, next_plans: dict[int, Plan]
+) -> None:
     axis = 5
     strict = np.ones(6)
     strict[axis] = 0.2
     ratios = []
     for seed in SEEDS[:3]:
         for_it = _made(experiment, seed, goal=PlanGoal(poor, strict))
-        for_all = _made(experiment, seed, goal=PlanGoal(poor, np.ones(6)))
-        ratios.append(for_it.predicted_std_percent[axis] / for_all.predicted_std_percent[axis])
+        ratios.append(for_it.predicted_std_percent[axis] / next_plans[seed].predicted_std_percent[axis])
     assert np.mean(ratios) < 0.98
 
 

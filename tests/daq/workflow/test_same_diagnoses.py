@@ -71,6 +71,7 @@ conditioning:
 
 SECTION = "axes.zero_offset (J2)"  #: That a given description changes
 RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
+SECONDS = 13.0
 FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
 FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
 """What a search tries here beside the corrections of the description: what is diagnosed hangs on none of it."""
@@ -85,7 +86,9 @@ def in_one(number: int, change: Callable[[Run], Run]) -> Mistake:
 
 def carrying(body: np.ndarray) -> Mistake:
     """Another body than the payload in the second loaded run."""
-    return lambda runs: [*runs[:3], small_recordings(three_axes_truth(), 0, count=RUNS, bodies={3: body})[3], *runs[4:]]
+    truth = three_axes_truth()
+    carried = small_recordings(truth, 0, count=RUNS, seconds=SECONDS, bodies={3: body})[3]
+    return in_one(3, lambda _: carried)
 
 
 def scaled(*factors: float) -> Mistake:
@@ -140,7 +143,7 @@ def mounted_on_a_wall(runs: Runs) -> Runs:
     """Recordings of an arm whose base is turned from what the cell says."""
     truth = three_axes_truth()
     wall = replace(truth, model=with_gravity(truth.model, np.array([0.0, -9.81, 0.0])))
-    return small_recordings(wall, 0, count=len(runs))
+    return small_recordings(wall, 0, count=len(runs), seconds=SECONDS)
 
 
 def exchanged(run: Run) -> Run:
@@ -150,7 +153,7 @@ def exchanged(run: Run) -> Run:
 
 def forgotten(run: Run) -> Run:
     """A run without the payload that it declares."""
-    bare = small_recordings(three_axes_truth(), 7, count=1)[0]
+    bare = small_recordings(three_axes_truth(), 7, count=1, seconds=SECONDS)[0]
     return replace(bare, name=run.name, payload=run.payload)
 
 
@@ -220,7 +223,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 
 @pytest.fixture(scope="module")
 def recorded() -> Runs:
-    return small_recordings(three_axes_truth(), 0, count=RUNS)
+    return small_recordings(three_axes_truth(), 0, count=RUNS, seconds=SECONDS)
 
 
 def said(diagnoses: tuple[Diagnosis, ...]) -> set[str]:

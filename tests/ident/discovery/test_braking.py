@@ -35,7 +35,7 @@ def clean(truth: Truth) -> Evidence:
     rng = np.random.default_rng(11)
     payloads = (None, MOUNTED, None, MOUNTED)
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0)
+        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0, averaged=2)
         for number, payload in enumerate(payloads)
     ]
     return gathered(truth, tuple(runs))
@@ -118,7 +118,7 @@ def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
     by_payload = replace(truth, model=replace(truth.model, friction_by_payload=True))
     rng = np.random.default_rng(12)
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0)
+        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0, averaged=2)
         for number, payload in enumerate((None, MOUNTED))
     ]
     fitted = with_effects(gathered(by_payload, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))

@@ -62,7 +62,7 @@ CASES = (
 
 def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> tuple[Made, tuple[Run, ...]]:
     """Recordings in which a joint needs more torque than the model says: on top of the currents, by virtual power."""
-    seconds = 12.0 if torque is _load_friction else 18.0 if mechanism is THREE_LEGS else 25.0
+    seconds = 12.0 if torque is _load_friction else 14.0 if mechanism is THREE_LEGS else 18.0
     made = recorded(mechanism, 7, seconds=seconds, noise_a=0.01)
     runs = []
     index = [one.name for one in made.model.robot.joints].index(joint)
@@ -197,7 +197,7 @@ def test_no_diagnosis_fails_on_a_closed_chain(mechanism: Mechanism) -> None:
 
 def test_a_clean_closed_chain_has_no_effect() -> None:
     for mechanism in (FIVE_BAR, PLANAR):
-        made = recorded(mechanism, 8, seconds=25.0, noise_a=0.01)
+        made = recorded(mechanism, 8, seconds=18.0, noise_a=0.01)
         steps = find_effects(
             gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)), np.random.default_rng(0)
         )

@@ -90,7 +90,7 @@ def _runs() -> tuple[Run, ...]:
     truth = three_axes_truth()
     rng = np.random.default_rng(8)
     return tuple(
-        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED, MOUNTED))
     )
 
@@ -100,7 +100,9 @@ def _polar_runs() -> tuple[Run, ...]:
     """Of two joints, a slide and a wrist."""
     rng = np.random.default_rng(5)
     return tuple(
-        record(polar_truth(), f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        record(
+            polar_truth(), f"r{number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload
+        )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
 
@@ -116,6 +118,7 @@ def _searched(mistake: Mistake) -> tuple[Step, ...]:
     return find_effects(_fitted(mistake), np.random.default_rng(0), GATES)
 
 
+@cache
 def _checked(mistake: Mistake) -> GeometryCheck:
     return check_geometry(_fitted(mistake), np.random.default_rng(0), GATES)
 
@@ -236,15 +239,16 @@ def test_the_check_names_what_is_late_with_its_delay(name: str) -> None:
 
 def test_a_current_behind_a_filter_is_late_once() -> None:
     """A delay fits its beginning alone; the position of that joint is not late as well."""
+    share = 0.4  # of a new sample
+    delay_s = (1.0 / share - 1.0) / _runs()[0].rate_hz
     runs: list[Run] = []
     for run in _runs()[:4]:
-        share = 1.0 - np.exp(-1.0 / (500.0 * 0.008))
         current = run.current_a.copy()
         current[:, 1] = signal.lfilter([share], [1.0, share - 1.0], current[:, 1] - current[0, 1]) + current[0, 1]
         runs.append(replace(run, current_a=current))
     check = check_geometry(gathered(three_axes_truth(), tuple(runs)), np.random.default_rng(0), GATES)
     assert [(one.effect.name, one.axis) for one in check.mistakes] == [("lag", 1)]
-    assert check.mistakes[0].coefficients[0] == pytest.approx(0.008, rel=0.2)
+    assert check.mistakes[0].coefficients[0] == pytest.approx(delay_s, rel=0.1)
 
 
 def test_undeclared_friction_is_no_late_current() -> None:
@@ -279,10 +283,10 @@ def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() ->
 
 
 def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
-    """Over clean cells, each component of the turn is as far from zero as its σ says."""
+    """Over clean cells, each component of the turn is as far from zero as its σ says: 32 of them tell it to 12 %."""
     truth = three_axes_truth()
     far: list[FloatArray] = []
-    for seed in range(30):
+    for seed in range(16):
         runs = small_recordings(truth, 1000 + seed)
         evidence = gather(identify(truth.model, runs, SMALL, keep_rows=True))
         gravity = check_geometry(evidence, np.random.default_rng(0), GATES).gravity
@@ -309,7 +313,7 @@ def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> No
     rng = np.random.default_rng(9)
     truth = gantry_truth()
     runs = tuple(
-        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
     found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
@@ -338,6 +342,7 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
                 rng,
                 seconds=15.0,
                 rate_hz=500.0,
+                averaged=2,
                 noise_a=0.1,
                 payload=payload,
                 bend=lambda q: q * less,
@@ -463,7 +468,7 @@ def test_a_gantry_that_leans_is_named_and_upright_it_bends_no_gain() -> None:
     leaning = Model(replace(robot, gravity_m_s2=rotation_by(lean) @ robot.gravity_m_s2), truth.model.drive_train)
     rng = np.random.default_rng(9)
     runs = tuple(
-        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, noise_a=NOISE_A, payload=payload)
+        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
     last = find_effects(gathered(replace(truth, model=leaning), runs), np.random.default_rng(0), GATES, ())[-1].after

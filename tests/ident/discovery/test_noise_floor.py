@@ -142,7 +142,7 @@ def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> No
 
 def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resting: tuple[Dataset, ...]) -> None:
     (first, *_) = _noisy(resting)
-    short = slice(0, 6000)
+    short = slice(0, round(6.0 * first.rate_hz))
     cut = replace(
         first,
         time_s=first.time_s[short],

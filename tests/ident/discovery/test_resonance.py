@@ -18,19 +18,31 @@ from ident.discovery.resonance import propose_resonances
 from ident.effects.dictionary import EFFECTS
 from ident.effects.signals import fitted_signals
 from ident.effects.transmission import Backlash, Elasticity, spring_torque, twist_acceleration
-from tests.ident.recordings import Truth, bent, search_problem_of, training_error
+from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, training_error
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 AXIS, COMPLIANCE, RATIO = 1, 8.0e-4, 0.2  # a resonance a few times as fast as the moves
+STEPS_HZ = 8000.0
 NEAR = frozenset({"elasticity", "lag", "backlash", "presliding", "load-friction"})
+
+
+@pytest.fixture(scope="module")
+def quick(small_truth: Truth) -> Evidence:
+    """Runs at 1 kHz: the flanks of a gap are crossed in some milliseconds."""
+    rng = np.random.default_rng(3)
+    runs = tuple(
+        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0, averaged=1)
+        for index in range(4)
+    )
+    return gathered(small_truth, runs)
 
 
 def _stepped(
     torque: FloatArray, inertia: FloatArray, rate_hz: float, compliance: float, half_gap: float = 0.0
 ) -> FloatArray:
     """Acceleration of the twist by small explicit steps from the first sample to the last, no windows."""
-    steps = 8
+    steps = max(8, round(STEPS_HZ / rate_hz))
     twist, rate, out = torque[0] * compliance + half_gap * np.sign(torque[0]), 0.0, np.zeros(len(torque))
     for k in range(len(torque) - 1):
         damping = 2.0 * RATIO * np.sqrt(inertia[k] / compliance)
@@ -83,14 +95,14 @@ def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(small: Evide
     assert last.estimate.gains == pytest.approx(small.estimate.gains, rel=0.01)
 
 
-def test_one_effect_explains_a_gap_with_flanks_that_give_and_none_joins(small: Evidence, small_truth: Truth) -> None:
-    start = _on_a_spring(small, small_truth, 2e-4, 4e-3)
+def test_one_effect_explains_a_gap_with_flanks_that_give_and_none_joins(quick: Evidence, small_truth: Truth) -> None:
+    start = _on_a_spring(quick, small_truth, 2e-4, 4e-3)
     last = _found(start)
     ((effect, axis),) = [(placed.effect, placed.axis) for placed in last.effects]
     assert isinstance(effect, Backlash)
     assert axis == AXIS
     assert last.estimate.parameters[len(last.rows_without_effects.columns)] == pytest.approx(4e-3, rel=0.15)
-    errors = [training_error(evidence).axes[AXIS] for evidence in (start, last, small)]
+    errors = [training_error(evidence).axes[AXIS] for evidence in (start, last, quick)]
     # The gap is refined, the compliance of its flanks is one of the three that were proposed.
     assert errors[1] ** 2 - errors[2] ** 2 < 0.25 * (errors[0] ** 2 - errors[2] ** 2)
 

@@ -20,7 +20,7 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
-from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
+from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, search_problem_of
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
@@ -92,8 +92,13 @@ def test_an_order_in_the_model_or_next_to_one_is_not_proposed_again(small: Evide
     assert propose_orders(problem, (PlacedEffect(nearest, 1),), rng, GATES) == {}
 
 
-def test_the_transform_is_the_sum_over_the_rows_of_each_move(small: Evidence) -> None:
-    problem = search_problem_of(small)
+def test_the_transform_is_the_sum_over_the_rows_of_each_move(small_truth: Truth) -> None:
+    rng = np.random.default_rng(3)
+    runs = tuple(
+        record(small_truth, name, rng, payload, noise_a=0.3, averaged=1)
+        for name, payload in (("bare", None), ("loaded", MOUNTED))
+    )
+    problem = search_problem_of(gathered(small_truth, runs))
     made = periodogram(problem, 1, 0)
     assert made is not None
     chosen = len(made.orders) // 10

@@ -58,7 +58,7 @@ def _clean(truth: Truth) -> Evidence:
     runs = []
     for number in range(4):
         payload = MOUNTED if number % 2 else None
-        runs.append(record(truth, f"run{number}", rng, payload, noise_a=0.02, seconds=16.0, rate_hz=500.0))
+        runs.append(record(truth, f"run{number}", rng, payload, noise_a=0.02, seconds=16.0, rate_hz=500.0, averaged=2))
     return gathered(truth, tuple(runs))
 
 

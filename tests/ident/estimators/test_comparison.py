@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ident.data.run import Run
 from ident.estimators.comparison import CUTOFF_FACTORS, ESTIMATORS, EstimatorComparison, try_estimators
-from tests.ident.recordings import CONDITIONING, GAINS, Truth
+from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
 FloatArray = NDArray[np.float64]
 
@@ -46,9 +46,11 @@ def test_without_noise_all_agree(truth: Truth, clean_runs: tuple[Run, ...]) -> N
         assert trial.gains == pytest.approx(GAINS, rel=2e-4)
 
 
-def test_a_filter_that_the_rate_does_not_allow_fails_alone(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_a_filter_that_the_rate_does_not_allow_fails_alone(truth: Truth) -> None:
+    rng = np.random.default_rng(3)
     slow = [
-        Run(run.name, run.time_s[::6], run.position_rad[::6], run.current_a[::6], run.payload) for run in noisy_runs
+        record(truth, name, rng, payload, noise_a=0.2, rate_hz=500.0, averaged=3)
+        for name, payload in (("bare", None), ("loaded", MOUNTED))
     ]
     found = try_estimators(truth.model, lambda: slow, CONDITIONING)
     assert all(trial.gains is not None for trial in found.declared)

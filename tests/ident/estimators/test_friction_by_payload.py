@@ -44,9 +44,11 @@ def truth() -> Truth:
 def runs(truth: Truth) -> tuple[Run, ...]:
     """Two runs without load, then two with it, when the arm is warm."""
     rng = np.random.default_rng(7)
-    bare = [record(truth, f"bare{number}", rng, noise_a=NOISE_A, rate_hz=500.0) for number in range(2)]
+    bare = [record(truth, f"bare{number}", rng, noise_a=NOISE_A, rate_hz=500.0, averaged=2) for number in range(2)]
     warm = _warmer(truth)
-    loaded = [record(warm, f"loaded{number}", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0) for number in range(2)]
+    loaded = [
+        record(warm, f"loaded{number}", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2) for number in range(2)
+    ]
     return (*bare, *loaded)
 
 
@@ -85,7 +87,7 @@ def test_what_the_payload_adds_to_friction_is_that_of_the_truth(truth: Truth, fo
 def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
     rng = np.random.default_rng(8)
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0)
+        record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     ]
     shared = identify(truth.model, runs, CONDITIONING)
@@ -100,7 +102,7 @@ def test_a_calibration_predicts_with_the_friction_of_what_is_mounted(
 ) -> None:
     mounted = MOUNTED if payload is not None else None
     arm = truth if mounted is None else _warmer(truth)
-    run = record(arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0)
+    run = record(arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0, averaged=2)
     data = differentiate(run, truth.model.drive_train, CONDITIONING)
     body = None if mounted is None else np.array(list(PAYLOAD_TRUTH.values()))
     # The model of a cell: that the calibration has friction by payload is read from its parameters.
@@ -155,7 +157,7 @@ def test_where_every_run_is_loaded_there_is_one_friction(truth: Truth) -> None:
     disc = Payload("disc", "a", dict(PAYLOAD_TRUTH))
     plate = Payload("plate", "b", {name: 0.5 * value for name, value in PAYLOAD_TRUTH.items()})
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0)
+        record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
         for number, payload in enumerate((disc, plate))
     ]
     by_payload = replace(truth.model, friction_by_payload=True)
@@ -175,8 +177,8 @@ def test_a_mounting_of_any_name_is_no_friction() -> None:
 def test_a_body_is_weighed_beside_bare_runs_of_another_friction(truth: Truth, calibration: Calibration) -> None:
     rng = np.random.default_rng(13)
     model = replace(truth.model, friction_by_payload=True)
-    bare = record(truth, "bare", rng, noise_a=NOISE_A, rate_hz=500.0)
-    loaded = record(_warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0)
+    bare = record(truth, "bare", rng, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
+    loaded = record(_warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
     mass = list(LINK_PARAMETERS).index("m")
     weighed = weigh(calibration, model, (loaded,), CONDITIONING, bare=(bare,))
     one_friction = weigh(calibration, truth.model, (loaded,), CONDITIONING, bare=(bare,))

@@ -33,7 +33,7 @@ def truth() -> Truth:
 
 @pytest.fixture(scope="module")
 def clean(truth: Truth) -> list[Run]:
-    return small_recordings(truth, 0)
+    return small_recordings(truth, 0, seconds=12.0)
 
 
 def found_in(truth: Truth, runs: list[Run], gains: FloatArray | None = None) -> TurnedGeometry | None:
