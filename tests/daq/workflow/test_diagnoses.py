@@ -42,7 +42,7 @@ def recorded() -> Shelf:
     truth, rng = tx40_truth(), np.random.default_rng(5)
 
     def made(name: str, *, mounted: bool = False) -> Run:
-        run = record(truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=16.0, rate_hz=200.0)
+        run = record(truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=12.0, rate_hz=200.0)
         return replace(run, digest=name.encode().hex().ljust(64, "0"))
 
     loaded = made("crossed", mounted=True)

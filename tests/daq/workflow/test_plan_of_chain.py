@@ -18,7 +18,7 @@ from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
 from ident.planning.gain_verdict import Hidden, verdicts
 
-SECONDS = 12.0
+SECONDS = 9.0
 
 
 @pytest.fixture(scope="module")
