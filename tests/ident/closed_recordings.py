@@ -17,7 +17,8 @@ from tests.ident.mechanisms import FIVE_BAR, PLANAR, Mechanism, leg_angles
 from tests.ident.recordings import positions
 
 FloatArray = NDArray[np.float64]
-RATE_HZ = 250.0
+RATE_HZ = 250.0  #: At which moves and noise are drawn
+AVERAGED = 2  #: Drawn samples that become one of a run
 MOUNTED = Payload("body", "a", {"m": 2.0})
 
 
@@ -84,15 +85,18 @@ def recorded(
     conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
     rng, runs = np.random.default_rng(seed), []
     for mounted in (None, MOUNTED):
-        q = axis_positions(mechanism, rng, seconds, share)
-        run = Run("loaded" if mounted else "bare", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), mounted)
+        drawn = axis_positions(mechanism, rng, seconds, share)
+        q = drawn[::AVERAGED]
+        time_s = np.arange(len(q)) * (AVERAGED / RATE_HZ)
+        run = Run("loaded" if mounted else "bare", time_s, q, np.zeros_like(q), mounted)
         data = differentiate(run, model.drive_train, conditioning)
         whole = standard.copy()
         if mounted is not None:
             whole[model.flange] += payload
         torque = np.einsum("mck,c->km", model.regressor(data.motion()), whole)
         torque = torque + preload_of(model, model.follow(data.motion()).to_motors, data.time_s, preload_nm)
-        current = noise_a * rng.standard_normal(q.shape)
+        noise = noise_a * rng.standard_normal(drawn.shape)
+        current = np.add.reduceat(noise, np.arange(0, len(noise), AVERAGED)) / AVERAGED
         current[1:-1] += torque / mechanism.gains
         runs.append(replace(run, current_a=current))
     return Made(model, conditioning, (runs[0], runs[1]), standard, payload)

@@ -16,7 +16,7 @@ from ident.data.run import Run
 from ident.discovery.before_after import assess, error_on, floor_on, holdout_change, left_on
 from ident.discovery.candidates import prepare_search
 from ident.discovery.evidence import gather, with_effects
-from ident.discovery.gates import own_unknowns, without_effects_of
+from ident.discovery.gates import Gates, own_unknowns, without_effects_of
 from ident.discovery.loop import find_effects
 from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.effects.effect import PlacedEffect
@@ -33,6 +33,7 @@ from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
 from tests.ident.recordings import search_problem_of
 
 FloatArray = NDArray[np.float64]
+GATES = Gates(draws=199)
 Torque = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 
 
@@ -90,7 +91,7 @@ def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torqu
     size = 0.12 if torque is _load_friction else {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
     identified = identify(made.model, runs, made.conditioning, keep_rows=True)
-    steps = find_effects(gather(identified), np.random.default_rng(0))
+    steps = find_effects(gather(identified), np.random.default_rng(0), GATES)
     places = [one.name for one in made.model.robot.places]
     found = [(placed.effect.name, places[placed.axis]) for placed in steps[-1].after.effects]
     assert found == [(family, joint)]
@@ -199,6 +200,6 @@ def test_a_clean_closed_chain_has_no_effect() -> None:
     for mechanism in (FIVE_BAR, PLANAR):
         made = recorded(mechanism, 8, seconds=18.0, noise_a=0.01)
         steps = find_effects(
-            gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)), np.random.default_rng(0)
+            gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)), np.random.default_rng(0), GATES
         )
         assert not steps[-1].after.effects
