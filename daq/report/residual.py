@@ -17,7 +17,7 @@ from daq.errors import counted
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_table, identifiability_notes, sigma_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
-from daq.report.split_names import names_by_split, placed_by
+from daq.report.split_names import names_by_split
 from daq.report.text import Sentence, break_lines, plain_table
 from daq.workflow.fit import Fit
 from daq.writeback.gates.fit import OF_DESCRIPTION
@@ -201,7 +201,7 @@ def declared_sentences(fitted: Fit) -> Iterator[str]:
     """Name the effects that the cell file declares."""
     for step in fitted.steps:
         if step.declared and step.accepted is not None:
-            name = placed_by(step.accepted).name_among(fitted.cell.place_names)
+            name = step.accepted.placed.name_among(fitted.cell.place_names)
             yield f"Declared in the cell file: {name}."
 
 
@@ -209,11 +209,11 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Say what a turn of the search added, and what it refused and why."""
     places = fitted.cell.place_names
     for aside in step.set_aside:
-        yield f"Not added: {placed_by(aside.finding).name_among(places)}: {aside.reason(places)}."
+        yield f"Not added: {aside.finding.placed.name_among(places)}: {aside.reason(places)}."
     if step.accepted is None:
         yield "No candidate passes every gate; nothing is added."
     else:
-        yield f"Added: {placed_by(step.accepted).name_among(places)}."
+        yield f"Added: {step.accepted.placed.name_among(places)}."
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -428,7 +428,7 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     last = fitted.steps[-1]
     for aside in step.set_aside:
         finding = aside.finding
-        axis = placed_by(finding).axis_name(axes)
+        axis = finding.placed.axis_name(axes)
         replaced = aside.rival is not None and aside.rival in last.after.effects
         if aside.rival is not None and aside.moved and step is last:
             yield (
@@ -451,16 +451,16 @@ def _refused(fitted: Fit) -> Iterator[str]:
     axes = fitted.cell.place_names
     last = fitted.steps[-1]
     # Those are reported with the reason already.
-    reported = [placed_by(aside.finding) for aside in last.set_aside]
+    reported = [aside.finding.placed for aside in last.set_aside]
     first: dict[int, Finding] = {}
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
         first.setdefault(finding.axis, finding)
-        failed = finding.explained >= MUCH and finding.refusals and placed_by(finding) not in reported
+        failed = finding.explained >= MUCH and finding.refusals and finding.placed not in reported
         if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
             strongest[finding.axis] = finding
     for axis, finding in first.items():
-        name = placed_by(finding).axis_name(axes)
+        name = finding.placed.axis_name(axes)
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
                 f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
@@ -469,7 +469,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
             if strongest.get(axis) is finding:
                 strongest.pop(axis)
     for finding in strongest.values():
-        name = placed_by(finding).axis_name(axes)
+        name = finding.placed.axis_name(axes)
         yield (
             f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
             f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
@@ -488,7 +488,7 @@ def _on_few_moves(fitted: Fit) -> Iterator[str]:
             best.setdefault(finding.axis, finding)
     axes = fitted.cell.place_names
     for finding in best.values():
-        name = placed_by(finding).axis_name(axes)
+        name = finding.placed.axis_name(axes)
         effect = effect_text(finding.effect, axes)
         yield f"These moves do not tell whether {name} has {effect}: {finding.too_few_moves}."
 

@@ -8,7 +8,7 @@ from daq.documents.calibration_file import CalibrationBody
 from daq.report.document import Figure, Report
 from daq.report.fit import Errors, coefficients, with_calibration
 from daq.report.residual import summary
-from daq.report.split_names import names_by_split, placed_by
+from daq.report.split_names import names_by_split
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter, RelativeErrors
@@ -363,7 +363,7 @@ def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
     sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
     return _named(
         FindingEntry,
-        placed_by(finding),
+        finding.placed,
         axes,
         finding,
         variable=finding.effect.abscissa,

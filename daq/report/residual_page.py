@@ -35,7 +35,6 @@ from daq.report.residual import (
     turn_sentences,
 )
 from daq.report.residual_document import ResidualFile, residual_report
-from daq.report.split_names import placed_by
 from daq.report.svg import Interval, intervals
 from daq.report.text import percent_text
 from daq.workflow.fit import Fit
@@ -223,8 +222,8 @@ def _gains(fitted: Fit, account: Account) -> str:
 def _turn(fitted: Fit, number: int, step: Step) -> str:
     axes, added = fitted.cell.place_names, step.accepted
     named = step.ranked(_SHOWN)
-    own = [placed_by(one) for one in named]
-    structures = [one for one in step.structures[:_SHOWN] if one.passed and placed_by(one) not in own]
+    own = [one.placed for one in named]
+    structures = [one for one in step.structures[:_SHOWN] if one.passed and one.placed not in own]
     shown = (*named, *structures)
     ranking = paragraph("No candidate could be tried.")
     if shown:

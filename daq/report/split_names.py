@@ -25,11 +25,6 @@ class SplitName:
     of: int  #: number of splits
 
 
-def placed_by(finding: Finding) -> PlacedEffect:
-    """Return the effect that a finding tests, on its axis."""
-    return PlacedEffect(finding.effect, finding.axis)
-
-
 def names_by_split(step: Step) -> tuple[SplitName, ...]:
     """Names that splits of the data choose for what a turn added, the most frequent first.
 
@@ -64,5 +59,5 @@ def names_by_split(step: Step) -> tuple[SplitName, ...]:
     # Of equals, what was added comes first.
     order = np.argsort(-count, kind="stable")
     return tuple(
-        SplitName(placed_by(candidates[number]), int(count[number]), folds) for number in order if count[number] > 0
+        SplitName(candidates[number].placed, int(count[number]), folds) for number in order if count[number] > 0
     )

@@ -44,7 +44,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
-from ident.discovery.geometry_check import GeometryCheck, check_geometry, placed_of
+from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.discovery.loop import Step
 from ident.discovery.search import Finding
@@ -333,7 +333,7 @@ def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Dia
     """
     diagnoses: list[Diagnosis] = []
     for found in check.mistakes:
-        placed = PlacedEffect(found.effect, found.axis)
+        placed = found.placed
         diagnosis = _finding_diagnosis(found, cell, model)
         diagnoses.append(_beside_alike(diagnosis, placed, check, cell, model))
     return tuple(diagnoses)
@@ -363,7 +363,7 @@ def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) 
     """Whether a correction that the fit did not tell apart from others stands beside one of them in a model."""
     for alike in check.alike:
         if alike.contain(placed):
-            return all(placed_of(found) in evidence.effects for found in alike.findings)
+            return all(found.placed in evidence.effects for found in alike.findings)
     return False
 
 
@@ -394,7 +394,7 @@ def open_correction_diagnoses(
             found.append(_open_correction(placed, values, deviations, why, cell, model, check))
     for aside in last.set_aside:
         finding = aside.finding
-        placed = PlacedEffect(finding.effect, finding.axis)
+        placed = finding.placed
         # What left by its own σ may be zero.
         is_known = placed in last.after.effects or placed in last.left_open
         if is_correction(placed) and not is_known:
@@ -410,7 +410,7 @@ def _values_in_search(steps: Sequence[Step], placed: PlacedEffect) -> tuple[Floa
             return coefficients_of(step.after.estimate, placed)
     for step in reversed(steps):
         found = step.accepted
-        if found is not None and PlacedEffect(found.effect, found.axis) == placed:
+        if found is not None and found.placed == placed:
             return found.coefficients, found.deviations
     raise ValueError(f"no step of the search has {placed.effect.name}; expected the steps that its verdict is of")
 
@@ -433,7 +433,7 @@ def _open_correction(
 
 def _finding_diagnosis(found: Finding, cell: Cell, model: Model) -> Diagnosis:
     """Diagnosis of a correction that a test has found."""
-    placed = PlacedEffect(found.effect, found.axis)
+    placed = found.placed
     return _correction_diagnosis(placed, found.coefficients, found.deviations, cell, model)
 
 
@@ -452,7 +452,7 @@ def _beside_alike(
     alike = next((one for one in check.alike if one.contain(placed)), None)
     if alike is None:
         return diagnosis
-    other_findings = [one for one in alike.findings if placed_of(one) != placed]
+    other_findings = [one for one in alike.findings if one.placed != placed]
     named = (diagnosis, *(_finding_diagnosis(one, cell, model) for one in other_findings))
     found = " or ".join(one.found for one in named)
     expected = dict.fromkeys(one.expected for one in named)

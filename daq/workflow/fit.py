@@ -45,7 +45,7 @@ from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
 from ident.discovery.before_after import error_on
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
-from ident.discovery.geometry_check import GeometryCheck, placed_of
+from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
@@ -91,7 +91,7 @@ class Fit:
     #: Covariance that the corrected geometry adds to gains and parameters; None where the described one was used.
     geometry_covariance: FloatArray | None = None
     diagnoses_before: tuple[Diagnosis, ...] = ()  #: of the fit before a search; empty where none was made
-    #: Verdicts on the gains that are not known well enough; empty where all are, or where nobody has asked.
+    #: Verdicts on the gains that are not known well enough; empty where all are, and before they are made.
     uncertain: tuple[GainVerdict, ...] = ()
 
     @property
@@ -419,7 +419,7 @@ def _with_description_after_search(closed: Fit) -> Fit:
     if description is None or not description.mistakes:
         return closed
     after = closed.steps[-1].after
-    if all(placed_of(mistake) in after.effects for mistake in description.mistakes):
+    if all(mistake.placed in after.effects for mistake in description.mistakes):
         return replace(closed, description=replace(description, mistakes=()))
     if len(after.effects) == after.declared:  # the model is the one beside which they were named
         return closed

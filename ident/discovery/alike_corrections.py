@@ -49,7 +49,7 @@ def alike_corrections(problem: SearchProblem, correction: Finding, findings: Seq
     torque_nm = problem.torque_at_rows(correction.effect, correction.axis)
     alike: list[Finding] = []
     for other in findings:
-        if PlacedEffect(other.effect, other.axis) not in correction.ambiguity or other.impossible:
+        if other.placed not in correction.ambiguity or other.impossible:
             continue
         of_other_nm = problem.torque_at_rows(other.effect, other.axis)
         if not explains_beside(problem, torque_nm, correction.held_out_fall, of_other_nm):

@@ -154,6 +154,21 @@ class CandidateTrial:
     #: Without the moves of most leverage, of a candidate that rests on few; None of one that rests on many.
     rest: MoveScores | None = None
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the coefficients by the scatter of moves, G⁻¹XᵀXG⁻¹ (Liang & Zeger, 1986), shape (p, p)."""
+        spread = self._spread()
+        return np.asarray(spread.T @ spread)
+
+    @property
+    def deviations(self) -> FloatArray:
+        """σ of the coefficients, by the same scatter, shape (p,)."""
+        return np.asarray(np.sqrt(np.sum(self._spread() ** 2, axis=0)))
+
+    def _spread(self) -> FloatArray:
+        """What each cluster adds to the coefficients, shape (clusters, p)."""
+        return np.asarray(self.scatter @ np.linalg.pinv(self.gram.sum(axis=0)))
+
 
 def shares_explained(search_problem: SearchProblem, trials: Sequence[CandidateTrial | None]) -> list[float]:
     """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""

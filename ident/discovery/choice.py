@@ -56,7 +56,7 @@ def choice_covariance(
     """
     shifts = [np.zeros((0, len(estimate.covariance)))]
     for finding, others in accepted:
-        placed = PlacedEffect(finding.effect, finding.axis)
+        placed = finding.placed
         found = {(one.effect, one.axis): one for one in others}
         rivals = [found[key] for one in finding.ambiguity if (key := (one.effect, one.axis)) in found]
         if rivals:

@@ -97,7 +97,7 @@ def _is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator, axes: Se
         return False
     if not mistakes:
         return False
-    corrections = tuple(PlacedEffect(found.effect, found.axis) for found in mistakes)
+    corrections = tuple(found.placed for found in mistakes)
     try:
         corrected = with_effects(evidence, (*evidence.effects, *corrections))
     except UNFITTED:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -25,7 +26,14 @@ from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
 from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
-from ident.discovery.late_currents import find_late_currents, rough_torque_rates, torque_rates, try_delays, with_delays
+from ident.discovery.late_currents import (
+    Delay,
+    find_late_currents,
+    rough_torque_rates,
+    torque_rates,
+    try_delays,
+    with_delays,
+)
 from ident.discovery.pairs_of_zeros import PairOfZeros, pairs_that_pass, try_pairs
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import EFFECTS, GEOMETRY
@@ -54,6 +62,8 @@ CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one
 SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
 SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
 LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
+LEAST_EARLY_SHARE = Gates().smallest_share
+"""Share of its motor's squared residual that a current which is early by itself explains; as any effect of a search."""
 MOST_ROUNDS = 4  #: Tests one after the other, each beside the mistakes that were found before
 LEAST_SETTLED_STD = 0.1
 """Least σ of a correction in the joint fit, in that of its column. Where gravity leans and a joint hardly moves, a base
@@ -80,7 +90,7 @@ class AlikeCorrections:
 
     def contain(self, placed: PlacedEffect) -> bool:
         """Whether a correction is one of them."""
-        return any(placed_of(found) == placed for found in self.findings)
+        return any(found.placed == placed for found in self.findings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +107,7 @@ class GeometryCheck:
     @property
     def certain_mistakes(self) -> tuple[Finding, ...]:
         """Mistakes that the data tell apart from every other correction."""
-        return tuple(one for one in self.mistakes if not any(alike.contain(placed_of(one)) for alike in self.alike))
+        return tuple(one for one in self.mistakes if not any(alike.contain(one.placed) for alike in self.alike))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +117,8 @@ class _Round:
     evidence: Evidence  #: beside which it was made
     problem: SearchProblem
     findings: tuple[Finding, ...]  #: of all corrections, the best first
-    mistakes: tuple[Finding, ...]  #: what it has found
-    corrected: Evidence | None  #: fitted with these; None without any
-    pairs: tuple[PairOfZeros, ...] = ()
+    pairs: tuple[PairOfZeros, ...]  #: of zeros that each alone would be seen
+    settled: _Settled | None  #: what it has found
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +126,7 @@ class _Settled:
     """Mistakes by the fit that has them in its model."""
 
     mistakes: tuple[Finding, ...]
-    corrected: Evidence
+    corrected: Evidence  #: with these mistakes corrected
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +138,11 @@ class _Suspect:
     values: FloatArray  #: their coefficients, shape (p,)
     held_out_fall: float  #: fall of the whitened ‖e‖² on held-out moves
 
+    @classmethod
+    def of_pair(cls, problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
+        """Two zeros."""
+        return cls(pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum()))
+
     @property
     def is_pair(self) -> bool:
         """Whether it is two zeros that hide each other."""
@@ -137,7 +151,7 @@ class _Suspect:
     @property
     def is_of_currents(self) -> bool:
         """Whether currents are late."""
-        return isinstance(self.effects[0].effect, (Lag, TimeSkew))
+        return isinstance(self.effects[0].effect, Delay)
 
     def explains_beside(self, problem: SearchProblem, rival_nm: FloatArray) -> bool:
         """Whether it explains most of what it does beside a rival, too."""
@@ -161,7 +175,7 @@ class _Rivals:
         own = {(placed.effect.name, placed.axis) for placed in suspect.effects}
         others: list[Finding] = []
         for found in self.findings:
-            is_of_currents = suspect.is_of_currents and isinstance(found.effect, (Lag, TimeSkew))
+            is_of_currents = suspect.is_of_currents and isinstance(found.effect, Delay)
             if (found.effect.name, found.axis) not in own and not is_of_currents:
                 others.append(found)
         return others
@@ -171,16 +185,15 @@ class _Rivals:
         if not isinstance(delay.effect, CLOCK):
             return False
         for found in self.findings:
-            is_fast = placed_of(found) in self.at_full_rate
+            is_fast = found.placed in self.at_full_rate
             if is_fast and found.passed and _is_of_axis(found, delay) and found.held_out_fall > delay.held_out_fall:
                 return True
         return False
 
     def torque_nm(self, problem: SearchProblem, found: Finding) -> FloatArray:
         """Columns of a finding at the joints, shape (m, p, r)."""
-        placed = PlacedEffect(found.effect, found.axis)
-        if placed in self.at_full_rate:
-            return self.at_full_rate[placed]
+        if found.placed in self.at_full_rate:
+            return self.at_full_rate[found.placed]
         return problem.torque_at_rows(found.effect, found.axis)
 
 
@@ -200,11 +213,11 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     first = _tested_once(evidence, rng, gates)
     rounds = [first]
     while len(rounds) < MOST_ROUNDS:
-        corrected = rounds[-1].corrected
-        if corrected is None:
+        settled = rounds[-1].settled
+        if settled is None:
             break
         try:
-            rounds.append(_tested_once(corrected, rng, gates))
+            rounds.append(_tested_once(settled.corrected, rng, gates))
         except TooFewMoves:  # of the corrected description, other moves may be valid
             break
     mistakes = _in_one_fit(rounds)
@@ -218,11 +231,6 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     )
 
 
-def placed_of(found: Finding) -> PlacedEffect:
-    """The effect of a finding on its axis."""
-    return PlacedEffect(found.effect, found.axis)
-
-
 def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> _Round:
     """Test geometry and clock once; what the model has in it already is not tested.
 
@@ -231,59 +239,61 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
     """
     problem = _problem_at_rows(evidence)
     of_geometry = _not_late_yet(_tested(problem, GEOMETRY), evidence)
-    screened = (*of_geometry, *_not_late_yet(try_delays(problem, rough_torque_rates(evidence)), evidence))
-    findings = rank_families(problem, screened, rng, gates)
-    hidden = _hidden_zeros(findings, problem.model.robot)
+    of_currents = _not_late_yet(try_delays(problem, rough_torque_rates(evidence)), evidence)
+    screened = rank_families(problem, (*of_geometry, *of_currents), rng, gates)
+    hidden = _hidden_zeros(screened, problem.model.robot)
     pairs = try_pairs(problem, [family for family in of_geometry if family.axis not in hidden])
     wrong_pairs = pairs_that_pass(problem, pairs, rng, gates)
-    if not any(found.passed for found in findings) and not wrong_pairs:
-        return _Round(evidence, problem, findings, (), None, pairs)
+    if not wrong_pairs and not any(found.passed for found in screened):
+        return _Round(evidence, problem, screened, pairs, None)
     rates_nm_s = torque_rates(evidence)
     of_currents = _not_late_yet(try_delays(problem, rates_nm_s), evidence)
     tested = (*of_geometry, *of_currents)
     findings = rank_families(problem, tested, rng, gates)
     suspects = _suspects(problem, findings, of_currents, rates_nm_s)
-    of_pairs = tuple(_suspect_of(problem, pair) for pair in wrong_pairs)
+    of_pairs = tuple(_Suspect.of_pair(problem, pair) for pair in wrong_pairs)
     rivals = _rivals(evidence, problem, tested, (*suspects, *of_pairs), rng, gates)
+    # A pair explains more than one zero does, whether it is needed or not.
     settled = _first_that_stands(evidence, problem, suspects, rivals)
     if settled is None:
         settled = _first_that_stands(evidence, problem, of_pairs, rivals)
-    if settled is None:
-        return _Round(evidence, problem, findings, (), None, pairs)
-    return _Round(evidence, problem, findings, settled.mistakes, settled.corrected, pairs)
+    return _Round(evidence, problem, findings, pairs, settled)
 
 
 def _not_late_yet(tested: Sequence[FamilyTrials], evidence: Evidence) -> tuple[FamilyTrials, ...]:
     """Trials without delays of what the model has a delay of: a second one would only mend the form of the first."""
-    late = {placed.axis for placed in evidence.effects if isinstance(placed.effect, (Lag, LatePosition))}
-    has_skew = any(isinstance(placed.effect, TimeSkew) for placed in evidence.effects)
     left: list[FamilyTrials] = []
     for family in tested:
         effect, _ = family.members[0]
-        is_second = has_skew if isinstance(effect, TimeSkew) else isinstance(effect, CLOCK) and family.axis in late
-        if not is_second:
+        if not _is_second_delay(PlacedEffect(effect, family.axis), evidence):
             left.append(family)
     return tuple(left)
 
 
+def _is_second_delay(placed: PlacedEffect, evidence: Evidence) -> bool:
+    """Whether the model has a delay of the same signals already."""
+    if isinstance(placed.effect, TimeSkew):
+        return any(isinstance(known.effect, TimeSkew) for known in evidence.effects)
+    if not isinstance(placed.effect, CLOCK):
+        return False
+    of_axis = [known.effect for known in evidence.effects if known.axis == placed.axis]
+    return any(isinstance(known, (Lag, LatePosition)) for known in of_axis)
+
+
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
     """The mistakes of all rounds with values and σ of the fit that has all of them; those that it shows."""
-    found: list[Finding] = []
-    fitted: Evidence | None = None
-    for tested in rounds:
-        found += tested.mistakes
-        fitted = tested.corrected or fitted
-    if fitted is None or len(found) == len(rounds[0].mistakes):
-        return tuple(found)
+    settled = [one.settled for one in rounds if one.settled is not None]
+    if not settled:
+        return ()
+    if len(settled) == 1:
+        return settled[0].mistakes
+    fitted = settled[-1].corrected
     shown: list[Finding] = []
-    for one in found:
-        placed = placed_of(one)
-        if placed not in fitted.effects:
-            continue
-        values, deviations = coefficients_of(fitted.estimate, placed)
+    for found in chain.from_iterable(one.mistakes for one in settled):
+        values, deviations = coefficients_of(fitted.estimate, found.placed)
         # What an earlier round found may have been a part of what a later one found.
-        if not in_noise(values, _covariance_of(fitted.estimate, placed), SHOWN):
-            shown.append(replace(one, coefficients=values, deviations=deviations))
+        if not in_noise(values, _covariance_of(fitted.estimate, found.placed), SHOWN):
+            shown.append(replace(found, coefficients=values, deviations=deviations))
     return tuple(shown)
 
 
@@ -295,7 +305,7 @@ def _all_alike(
     for mistake in mistakes:
         if not isinstance(mistake.effect, GeometryEffect):
             continue
-        others = tuple(placed_of(one) for one in mistakes if one is not mistake)
+        others = tuple(one.placed for one in mistakes if one is not mistake)
         beside = _round_beside(rounds, evidence, others)
         if beside is None:
             try:
@@ -304,7 +314,7 @@ def _all_alike(
                 continue
         alike = _alike(beside, mistake)
         if alike:
-            axes = axes_to_move([placed_of(one) for one in alike], evidence.model.robot, evidence.fit_runs)
+            axes = axes_to_move([one.placed for one in alike], evidence.model.robot, evidence.fit_runs)
             found.append(AlikeCorrections(alike, axes))
     return tuple(found)
 
@@ -333,7 +343,7 @@ def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
     """A mistake and the corrections that the data do not tell apart from it; empty where it stands alone."""
     corrections = [found for found in beside.findings if isinstance(found.effect, GeometryEffect)]
     # As it was ranked among the corrections: its ambiguity names those that folds do not distinguish from it.
-    as_found = next((one for one in corrections if placed_of(one) == placed_of(mistake)), None)
+    as_found = next((one for one in corrections if one.placed == mistake.placed), None)
     if as_found is None:
         return ()
     others = alike_corrections(beside.problem, as_found, corrections)
@@ -342,7 +352,7 @@ def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
     alike = [mistake]
     for other in others:
         torque_nm = beside.problem.torque_at_rows(other.effect, other.axis)
-        suspect = _Suspect((placed_of(other),), torque_nm, other.coefficients, other.held_out_fall)
+        suspect = _Suspect((other.placed,), torque_nm, other.coefficients, other.held_out_fall)
         settled = _settled(beside.evidence, suspect, (other,))
         alike.append(other if settled is None else settled.mistakes[0])
     return tuple(alike)
@@ -362,9 +372,9 @@ def _suspects(
     suspects: list[_Suspect] = []
     passed = [found for found in findings if found.passed]
     for found in passed:
-        if not isinstance(found.effect, (Lag, TimeSkew)):
+        if not isinstance(found.effect, Delay):
             torque_nm = problem.torque_at_rows(found.effect, found.axis)
-            suspects.append(_Suspect((placed_of(found),), torque_nm, found.coefficients, found.held_out_fall))
+            suspects.append(_Suspect((found.placed,), torque_nm, found.coefficients, found.held_out_fall))
     if any(isinstance(found.effect, CLOCK) for found in passed):
         late = find_late_currents(problem, of_currents, rates_nm_s)
         if late is not None:
@@ -372,10 +382,6 @@ def _suspects(
             fall = before - float(late.held_out.sum())
             suspects.append(_Suspect(late.effects, late.torque_nm, late.seconds, fall))
     return tuple(sorted(suspects, key=lambda one: -one.held_out_fall))
-
-
-def _suspect_of(problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
-    return _Suspect(pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum()))
 
 
 def _rivals(
@@ -498,8 +504,9 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
         shown.append(settled)
-    is_half = suspect.is_pair and len(shown) < len(own)  # the other zero alone has not passed
-    return _Settled(tuple(shown), corrected) if shown and not is_half else None
+    if suspect.is_pair and len(shown) < len(own):
+        return None  # the other zero alone has not passed
+    return _Settled(tuple(shown), corrected) if shown else None
 
 
 def _is_unlikely_delay(found: Finding) -> bool:
@@ -512,7 +519,7 @@ def _is_unlikely_delay(found: Finding) -> bool:
     if abs(delay_s) < LEAST_DELAY_S:
         return True
     is_early_alone = delay_s < 0.0 and isinstance(found.effect, Lag)
-    return is_early_alone and found.explained < Gates().smallest_share
+    return is_early_alone and found.explained < LEAST_EARLY_SHARE
 
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
@@ -560,7 +567,7 @@ def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int
     hidden: list[tuple[int, int]] = []
     for pair in pairs:
         largest = np.array([_seen_std(robot, axis) for axis in pair.axes])
-        if np.any(pair.deviations > largest):
+        if np.any(pair.trial.deviations > largest):
             hidden.append(pair.axes)
     return tuple(hidden)
 

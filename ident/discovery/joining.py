@@ -36,12 +36,12 @@ from ident.discovery.gates import (
     whitened_columns,
     without_effects_of,
 )
+from ident.discovery.late_currents import Delay
 from ident.discovery.refinement import refine_together
 from ident.discovery.rotor_search import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.friction import SpeedFriction
 from ident.effects.geometry_corrections import is_correction
 from ident.effects.signals import Abscissa
@@ -113,7 +113,7 @@ def join(
         return pruned
     if keys_of(pruned.evidence) in seen:
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
-    last = PlacedEffect(accepted.effect, accepted.axis)
+    last = accepted.placed
     why = "" if pruned is joined else refuted_by_instruments(pruned.evidence, last)
     return SetAside(accepted, why) if why else pruned
 
@@ -145,14 +145,14 @@ def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAsi
         )
         adds_to_term = is_better(beside, by_term.held_out.sum(axis=1))
         if not adds_to_term and is_inadequate(again, term) and (moved := _moved_by(model, again)):
-            return SetAside(found, "{rival} explains clearly more", PlacedEffect(term.effect, term.axis), moved)
+            return SetAside(found, "{rival} explains clearly more", term.placed, moved)
     return None
 
 
 def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
     evidence, problem = model.evidence, model.search_problem
-    last = PlacedEffect(accepted.effect, accepted.axis)
+    last = accepted.placed
     # Asked before the refit, which takes longer.
     if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
         return SetAside(accepted, moved=moved)
@@ -314,7 +314,7 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
 
 def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
-    if isinstance(placed.effect, (Lag, TimeSkew)):
+    if isinstance(placed.effect, Delay):
         # A delay is judged by its length: beside dry friction it is a small part of a motor's residual.
         gates = replace(gates, explained=0.0, error_fall=0.0)
     estimate = model.evidence.estimate

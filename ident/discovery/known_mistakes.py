@@ -58,7 +58,7 @@ def join_mistakes(
             break
         failing: list[tuple[float, Finding, str]] = []
         for one in left:
-            fall, why = beside_others(joined, PlacedEffect(one.effect, one.axis), rng, gates)
+            fall, why = beside_others(joined, one.placed, rng, gates)
             if why:
                 failing.append((fall, one, why))
         if failing:
@@ -89,7 +89,10 @@ def _worst_of_model(
         fall, why = beside_others(joined, placed, rng, gates)
         if why:
             failing.append((fall, placed))
-    return min(failing, key=lambda one: one[0])[1] if failing else None
+    if not failing:
+        return None
+    _, worst = min(failing, key=lambda one: one[0])
+    return worst
 
 
 def _with_mistakes(model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Sequence[Finding]) -> Evidence:
@@ -99,6 +102,6 @@ def _with_mistakes(model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Se
         NotConverged, RankDeficient: see `ident.identify`.
     """
     before = model.evidence
-    placed = tuple(PlacedEffect(one.effect, one.axis) for one in mistakes)
+    placed = tuple(one.placed for one in mistakes)
     fitted = with_effects(before, (*kept, *placed), model.search_problem.runs)
     return replace(fitted, declared=before.declared)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
+from ident.discovery.candidates import FamilyTrials, SearchProblem
 from ident.discovery.evidence import Evidence, coefficients_of, with_effects
 from ident.effects.effect import PlacedEffect, at_joints
 from ident.effects.electrical import Lag, TimeSkew
@@ -113,7 +113,7 @@ def find_late_currents(
     if trial is None:
         return None
     seconds = trial.coefficients
-    covariance = _covariance(trial)
+    covariance = trial.covariance
     if skews and _are_alike(seconds, covariance):
         effect, of_skew = skews[0].members[0]
         placed = PlacedEffect(effect, skews[0].axis)
@@ -136,12 +136,6 @@ def find_late_currents(
         seconds=of_late.coefficients,
         held_out=of_late.held_out.sum(axis=1),
     )
-
-
-def _covariance(trial: CandidateTrial) -> FloatArray:
-    """Covariance of the coefficients by the scatter of moves, shape (p, p)."""
-    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
-    return np.asarray(spread.T @ spread)
 
 
 def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:

@@ -153,30 +153,48 @@ def find_effects(
     steps: list[Step] = []
     if mistakes is None:
         mistakes = _named_mistakes(start, rng, gates) if geometry else ()
-    delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
+    delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
     if corrections:
         progress("adding what the check of the description has named")
         corrected = join_mistakes(model, corrections, rng, gates)
         steps += _steps_of(corrected, mistakes, detection_limits_nm(model.search_problem, gates))
         model = corrected.model
-    of_check = len(steps)  # turns whose rivals were compared in the check
-    is_delay_open = bool(delays)
     seen = {keys_of(start), keys_of(model.evidence)}
-    for _ in range(MAX_EFFECTS):
-        step, joined = _turn(model, rng, gates, (*geometry, *families), seen, progress, names)
-        if len(steps) > of_check:
+
+    def search(model: JointFit, most: int) -> tuple[list[Step], JointFit]:
+        return _searched(model, most, rng, gates, (*geometry, *families), seen, progress, names)
+
+    found, model = search(model, MAX_EFFECTS)
+    if delays and found[-1].accepted is None:
+        progress("testing the clock beside what was found")
+        late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
+        if late.joined:
+            *found, last = found  # a turn that has found nothing is the last one of all
+            found += _steps_of(late, late.joined, last.limits_nm)
+            seen.add(keys_of(late.model.evidence))
+            further, model = search(late.model, MAX_EFFECTS - len(found))
+            found += further
+    steps += found
+    return (*steps[:-1], end_search(steps, model, gates, rng=rng))
+
+
+def _searched(
+    model: JointFit,
+    most: int,
+    rng: np.random.Generator,
+    gates: Gates,
+    families: tuple[tuple[Effect, ...], ...],
+    seen: set[frozenset[EffectKey]],
+    progress: Callable[[str], None],
+    names: Sequence[str],
+) -> tuple[list[Step], JointFit]:
+    """Take turns until one finds nothing, at most so many and at least one: the turns, and the model behind them."""
+    steps: list[Step] = []
+    for _ in range(max(most, 1)):
+        step, joined = _turn(model, rng, gates, families, seen, progress, names)
+        if steps:
             steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
-        if joined is None and is_delay_open:
-            is_delay_open = False
-            progress("testing the clock beside what was found")
-            late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
-            if late.joined:
-                steps += _steps_of(late, late.joined, step.limits_nm)
-                of_check = len(steps)
-                model = late.model
-                seen.add(keys_of(model.evidence))
-                continue
         steps.append(step)
         if joined is None:
             break
@@ -184,7 +202,7 @@ def find_effects(
         seen.add(keys_of(model.evidence))
     else:
         steps[-1] = _settled(steps[-1], model.search_problem, (), rng, gates)
-    return (*steps[:-1], end_search(steps, model, gates, rng=rng))
+    return steps, model
 
 
 def _named_mistakes(start: Evidence, rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
@@ -327,7 +345,7 @@ def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
     """The finding by which an effect joined last."""
     for step in reversed(steps):
         found = step.accepted
-        if found is not None and PlacedEffect(found.effect, found.axis) == placed:
+        if found is not None and found.placed == placed:
             return found
     return None
 
@@ -337,7 +355,7 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates, left_open
     estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
     for step in steps:  # an effect that left and joined again counts by its last turn
         found = step.accepted
-        if found is not None and (placed := PlacedEffect(found.effect, found.axis)) in model.evidence.effects:
+        if found is not None and (placed := found.placed) in model.evidence.effects:
             accepted[placed] = found, (*step.findings, *step.structures)
     last = steps[-1]
     left = _small_findings(last, model, gates)

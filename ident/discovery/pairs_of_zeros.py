@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
-from ident.discovery.gates import Gates
-from ident.discovery.search import chances, sigma_by_moves
+from ident.discovery.gates import Gates, probability_of_zero
+from ident.discovery.search import chances
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import ZeroOffset
 
@@ -27,22 +26,17 @@ SCREENED_CHANCE = 1e-4  #: Of Wald's test, above which the moves' random signs n
 
 @dataclass(frozen=True, slots=True)
 class PairOfZeros:
-    """What is known of the zeros of two joints when both are fitted."""
+    """Zeros of two joints as one candidate."""
 
     effects: tuple[PlacedEffect, PlacedEffect]
     torque_nm: FloatArray  #: their columns at the joints, shape (m, 2, r)
-    trial: CandidateTrial
+    trial: CandidateTrial  #: of both columns
 
     @property
     def axes(self) -> tuple[int, int]:
-        """Of the two joints."""
+        """Axes of the two joints."""
         first, second = self.effects
         return first.axis, second.axis
-
-    @property
-    def deviations(self) -> FloatArray:
-        """σ of both zeros, by the scatter of moves, shape (2,)."""
-        return sigma_by_moves(self.trial)
 
     def fall(self, problem: SearchProblem) -> FloatArray:
         """Fall of ‖e‖² on each fold of held-out moves, shape (folds,)."""
@@ -84,21 +78,15 @@ def pairs_that_pass(
         rng: of the bootstrap.
         gates: limits; the probability is that of the strongest of all pairs under noise.
     """
-    if all(_chance_by_wald(pair.trial) > SCREENED_CHANCE for pair in pairs):
+    trials = tuple(pair.trial for pair in pairs)
+    if all(probability_of_zero(trial.coefficients, trial.covariance) > SCREENED_CHANCE for trial in trials):
         return ()
-    passed: list[tuple[float, PairOfZeros]] = []
-    chance_of_pair = chances(tuple(pair.trial for pair in pairs), rng, gates.draws)
-    for pair, chance in zip(pairs, chance_of_pair, strict=True):
+    passed: list[PairOfZeros] = []
+    for pair, chance in zip(pairs, chances(trials, rng, gates.draws), strict=True):
         fall = pair.fall(problem)
-        is_certain = bool(np.all(np.abs(pair.trial.coefficients) > CERTAIN_SIGMAS * pair.deviations))
-        is_better = float(fall.sum()) > 0.0 and float(np.mean(fall > 0.0)) >= gates.folds_better
+        share_of_folds = float(np.mean(fall > 0.0))
+        is_certain = np.all(np.abs(pair.trial.coefficients) > CERTAIN_SIGMAS * pair.trial.deviations)
+        is_better = fall.sum() > 0.0 and share_of_folds >= gates.folds_better
         if is_certain and is_better and chance <= gates.false_alarm:
-            passed.append((float(fall.sum()), pair))
-    passed.sort(key=lambda one: -one[0])
-    return tuple(pair for _, pair in passed)
-
-
-def _chance_by_wald(trial: CandidateTrial) -> float:
-    """Probability of coefficients as far from zero where both are zero, by the scatter of moves."""
-    wald = float(trial.score @ np.linalg.pinv(trial.scatter.T @ trial.scatter) @ trial.score)
-    return float(scipy.special.chdtrc(len(trial.score), wald))
+            passed.append(pair)
+    return tuple(sorted(passed, key=lambda pair: -float(pair.fall(problem).sum())))

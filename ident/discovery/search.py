@@ -79,6 +79,11 @@ class Finding:
     too_few_moves: str = ""
     impossible: str = ""  #: coefficients that physics does not allow, in words: one of the refusals
 
+    @property
+    def placed(self) -> PlacedEffect:
+        """The effect on its axis."""
+        return PlacedEffect(self.effect, self.axis)
+
 
 def rank_effects(
     search_problem: SearchProblem,
@@ -151,7 +156,7 @@ def rank_families(
     # Those that a paired comparison cannot distinguish from it.
     rivals = ~(better | better.T | np.eye(len(ranked), dtype=np.bool_))
     rivals &= np.array([finding.held_out_fall > 0 for finding in ranked])
-    places = [PlacedEffect(finding.effect, finding.axis) for finding in ranked]
+    places = [finding.placed for finding in ranked]
     return tuple(
         replace(finding, ambiguity=tuple(places[index] for index in np.flatnonzero(row)))
         for finding, row in zip(ranked, rivals, strict=True)
@@ -288,7 +293,7 @@ def _judge(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
-        deviations=sigma_by_moves(trial),
+        deviations=trial.deviations,
         probability=chance,
         folds_better=folds_better,
         explained=explained,
@@ -313,13 +318,7 @@ def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     """
     is_richer = len(effect.coefficients) > fewest and not effect.settings.get("with_rotor")
     tolerance = 0.0 if is_richer else SIGMAS
-    return impossible(effect.coefficients, trial.coefficients, sigma_by_moves(trial), tolerance)
-
-
-def sigma_by_moves(trial: CandidateTrial) -> FloatArray:
-    """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986), shape (p,)."""
-    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
-    return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
+    return impossible(effect.coefficients, trial.coefficients, trial.deviations, tolerance)
 
 
 def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:

@@ -87,7 +87,7 @@ def recorded(
     for mounted in (None, MOUNTED):
         drawn = axis_positions(mechanism, rng, seconds, share)
         q = drawn[::AVERAGED]
-        time_s = np.arange(len(q)) * (AVERAGED / RATE_HZ)
+        time_s = np.asarray(np.arange(len(q)) * (AVERAGED / RATE_HZ), dtype=np.float64)
         run = Run("loaded" if mounted else "bare", time_s, q, np.zeros_like(q), mounted)
         data = differentiate(run, model.drive_train, conditioning)
         whole = standard.copy()

@@ -21,7 +21,6 @@ from daq.workflow.fit import BOOTSTRAP_SEED
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
-from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import rotation_by
 from ident.equations.instants import read_instants
 from ident.errors import CurrentUnsigned, IdentificationError
@@ -98,7 +97,7 @@ def of_description(found: Identification) -> list[str]:
     """What the test of description and clock beside a fit names: each effect and its axis."""
     check = geometry_beside(gather(found), BOOTSTRAP_SEED)
     mistakes = () if check is None else check.mistakes
-    return [PlacedEffect(one.effect, one.axis).name_among(AXES) for one in mistakes]
+    return [one.placed.name_among(AXES) for one in mistakes]
 
 
 def delayed(

@@ -331,10 +331,10 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     findings = rank_effects(search_problem_of(start, arm.cache), np.random.default_rng(0), GATES)
     best = findings[0]
     assert best.passed
-    names = [(placed.effect.name, placed.axis) for placed in (PlacedEffect(best.effect, best.axis), *best.ambiguity)]
+    names = [(placed.effect.name, placed.axis) for placed in (best.placed, *best.ambiguity)]
     assert (planted.family, planted.axis) in names
     own = next(f for f in findings if (f.effect.name, f.axis) == (planted.family, planted.axis))
-    after = with_effects(start, (PlacedEffect(own.effect, own.axis),))
+    after = with_effects(start, (own.placed,))
     count = len(planted.expected)
     found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
     assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))

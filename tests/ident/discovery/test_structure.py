@@ -17,7 +17,7 @@ from ident.discovery.loop import Step, find_effects
 from ident.discovery.search import choose_effect, rank_effects
 from ident.discovery.structure import detection_limits_nm
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
 from tests.ident.recordings import Truth, acting_on, bent, search_problem_of, training_error
@@ -89,7 +89,7 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     found = [step.accepted, *(aside.finding for aside in step.set_aside)]
     term = next(one for one in found if one and (one.effect.name, one.axis) == (case.name, case.axis))
     # Most of the excess of that axis' squared error is gone with it.
-    joined = with_effects(start, (PlacedEffect(term.effect, term.axis),))
+    joined = with_effects(start, (term.placed,))
     before, after, clean = (training_error(e).axes[case.axis] ** 2 for e in (start, joined, small))
     assert before - after > 0.6 * (before - clean)
     # It bends a gain, or is in the model.
