@@ -12,7 +12,7 @@ from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis
 from daq.errors import ControllerChanged
 from daq.files import sha256_of
 from daq.jobs.context import NextRun, SessionContext, before_motion
-from daq.jobs.guided import guided, plan_moves, plan_with_room, require_same_cell
+from daq.jobs.guided import guided, plan_with_room, require_same_cell, say_moves, write_plan
 from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, record_valid
 from daq.jobs.reporting import audit_entry, undo_command
@@ -20,7 +20,6 @@ from daq.jobs.session import CALIBRATION, Session
 from daq.jobs.stages import calibration_made
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import read_history
-from daq.workflow.plan import Plan
 from daq.workflow.validate import Validation
 from ident.calibration import Calibration
 
@@ -60,12 +59,9 @@ class Accept:
         _require_written(context, session)
         last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
-        seed = context.settings.seed + SEED_STEP
-
-        def make(duration_s: float) -> Plan:
-            return plan_moves(context, RUN, path, seed, duration_s)
-
-        plan, _ = plan_with_room(context, self.duration_s, make)
+        made, _ = plan_with_room(context, context.settings.seed + SEED_STEP, self.duration_s)
+        plan = write_plan(context, path, made)
+        say_moves(context, RUN, path)
         planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)
         context.operator.mount(planned)
         record_valid(context, session, NextRun(planned, plan))

@@ -25,7 +25,6 @@ from daq.jobs.session import Basis, Session
 from daq.jobs.stages import TO_DECISION, Certify, Stage, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
-from daq.workflow.plan import Plan
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
 from ident.errors import ChannelsExchanged, GeometryTurned
@@ -211,10 +210,7 @@ def _ready_text(context: SessionContext) -> str:
 
 
 def _predicted_text(context: SessionContext, block_s: float) -> str:
-    def make(duration_s: float) -> Plan:
-        return context.tools.plan(context.cell, seed=context.settings.seed, duration_s=duration_s)
-
-    plan, _ = plan_with_room(context, block_s, make)
+    plan, _ = plan_with_room(context, context.settings.seed, block_s)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
     return f"predicted σ after one bare and one loaded block: {listed}"

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,12 +45,12 @@ from daq.jobs.journal import Level
 from daq.jobs.recording import log_of, move_without_log
 from daq.jobs.session import Session
 from daq.workflow.accepted_room import AcceptedRoom, accepted_room
+from daq.workflow.diagnoses import geometry_refusal
 from daq.workflow.experiment import Experiment, experiment_of
 from daq.workflow.outlook import Outlook, help_with, outlook_of
 from daq.workflow.plan import Plan, load_plan, save_plan, slowed
 from ident.errors import ChannelsExchanged, Diagnosis, GeometryTurned, IdentificationError
 from ident.estimators.estimate import Estimate
-from ident.estimators.turned_geometry import GEOMETRY
 from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
@@ -225,7 +226,8 @@ class UntilPrecise:
             return session.update(checked_blocks=recorded)
         if mistake.is_of_body:
             logs = [log_of(session, block.name) for block in in_order]
-            refuse_geometry(context.tools.geometry(context.cell, logs))
+            turned = context.tools.geometry(context.cell, logs)
+            _refuse_geometry(() if turned is None else (turned,))
         context.journal.say(Level.WARNING, "mistake in a block", block=last.name, text=mistake.text)
         if not context.operator.record_again(_planned(session, last), mistake.text):
             context.journal.say(Level.NOTICE, "kept as it is", block=last.name)
@@ -296,25 +298,18 @@ class UntilPrecise:
         room = self._accepted_room(context, session, experiment)
         role = self._role_of(context, guided(session), estimate.gains, number)
         is_loaded = role is not BlockRole.BARE
-        next_experiment = outlook.experiment(experiment, is_loaded=is_loaded, room=room)
-
-        def make(duration_s: float) -> Plan:
-            seed = self.settings.seed + number
-            context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-            return context.tools.plan(
-                context.cell,
-                seed=seed,
-                duration_s=duration_s,
-                speed=room.speed,
-                # More moves never make what is known worse.
-                largest_condition=np.inf,
-                largest_std_percent=np.inf,
-                experiment=next_experiment,
-                goal=outlook.goal(self.settings.target_percent),
-                box=room.box,
-            )
-
-        session, made = self._with_room(context, session, make)
+        session, made = self._with_room(
+            context,
+            session,
+            number,
+            speed=room.speed,
+            # More moves never make what is known worse.
+            largest_condition=np.inf,
+            largest_std_percent=np.inf,
+            experiment=outlook.experiment(experiment, is_loaded=is_loaded, room=room),
+            goal=outlook.goal(self.settings.target_percent),
+            box=room.box,
+        )
         worst = estimate.worst
         axis = context.cell.axis_names.index(worst.axis)
         predicted_percent = float(outlook.scale[axis]) * made.predicted_std_percent[axis]
@@ -338,24 +333,20 @@ class UntilPrecise:
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
         inside = replace(experiment, scene=room.scene(experiment.scene))
-
-        def make(duration_s: float) -> Plan:
-            seed = self.settings.seed + number
-            context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-            return context.tools.plan(
-                context.cell, seed=seed, duration_s=duration_s, speed=room.speed, experiment=inside, box=room.box
-            )
-
-        session, made = self._with_room(context, session, make)
+        session, made = self._with_room(context, session, number, speed=room.speed, experiment=inside, box=room.box)
         return session, write_plan(context, path, made)
 
     def _with_room(
-        self, context: SessionContext, session: Session, make: Callable[[float], Plan]
+        self, context: SessionContext, session: Session, number: int, **further: Any
     ) -> tuple[Session, Plan]:
-        """Make a plan of the duration of a block; where it has to be longer, later blocks are, too."""
-        plan, block_s = plan_with_room(context, self.block_s(guided(session)), make)
-        if block_s > self.block_s(guided(session)):
-            session = session.update(block_s=block_s)
+        """Make the moves of a block by its number from 0; where they have to be longer, those of later blocks are, too.
+
+        ``further`` are arguments of the planner.
+        """
+        block_s = self.block_s(guided(session))
+        plan, taken_s = plan_with_room(context, self.settings.seed + number, block_s, **further)
+        if taken_s > block_s:
+            session = session.update(block_s=taken_s)
         return session, plan
 
     def _accepted_room(self, context: SessionContext, session: Session, experiment: Experiment) -> AcceptedRoom:
@@ -381,11 +372,10 @@ class UntilPrecise:
         self, context: SessionContext, session: Session, name: str, number: int, path: Path
     ) -> tuple[Session, Plan]:
         """Make the moves of one of the first blocks by its name, and its number from 0."""
-
-        def make(duration_s: float) -> Plan:
-            return plan_moves(context, name, path, self.settings.seed + number, duration_s)
-
-        return self._with_room(context, session, make)
+        session, made = self._with_room(context, session, number)
+        plan = write_plan(context, path, made)
+        say_moves(context, name, path)
+        return session, plan
 
     def _estimate(self, context: SessionContext, session: Session) -> BlockEstimate:
         """Estimate the gains of the blocks so far; none where they cannot be identified yet.
@@ -399,7 +389,7 @@ class UntilPrecise:
         target_percent = self.settings.target_percent
         try:
             fitted = context.tools.fit(logs, holdout=unseen)
-            refuse_geometry(next((one for one in fitted.diagnoses if one.name in GEOMETRY), None))
+            _refuse_geometry(fitted.diagnoses)
             gains = gains_so_far(context, fitted.estimate, target_percent)
             if all(gain.is_precise for gain in gains):
                 return BlockEstimate(gains)
@@ -467,45 +457,49 @@ def _next_number(state: GuidedState) -> int:
     return next(number for number in count() if number not in taken)
 
 
-def plan_with_room(context: SessionContext, duration_s: float, make: Callable[[float], Plan]) -> tuple[Plan, float]:
+def _refuse_geometry(diagnoses: Sequence[Diagnosis]) -> None:
+    """Refuse blocks in a geometry that is far from the described one.
+
+    Raises:
+        GeometryTurned: with the words of the diagnosis.
+    """
+    refused = geometry_refusal(diagnoses)
+    if refused is not None:
+        raise refused
+
+
+def plan_with_room(context: SessionContext, seed: int, duration_s: float, **further: Any) -> tuple[Plan, float]:
     """Make a plan, of twice the duration where it has no room for enough moves, and so on; return both.
 
     Args:
         context: of the session.
+        seed: of the moves.
         duration_s: asked for.
-        make: makes the plan of a duration.
+        **further: arguments of the planner.
 
     Raises:
         PlanTooShort: even the longest one has no room.
+        UsageError, ConfigurationInconsistent: there are no such moves.
     """
-    for _ in range(MOST_DOUBLINGS):
+    longest_s = duration_s * 2.0**MOST_DOUBLINGS
+    taken_s = duration_s
+    while True:
+        context.journal.say(Level.INFO, "planning", seed=seed, duration_s=taken_s)
         try:
-            return make(duration_s), duration_s
+            return context.tools.plan(context.cell, seed=seed, duration_s=taken_s, **further), taken_s
         except PlanTooShort as error:
-            asked_s = duration_s
-            duration_s *= 2.0
+            if taken_s >= longest_s:
+                raise
+            short_s = taken_s
+            taken_s = 2.0 * short_s
             context.journal.say(
                 Level.NOTICE,
                 "longer blocks",
-                asked_s=asked_s,
+                asked_s=short_s,
                 found=error.found,
                 expected=error.expected,
-                duration_s=duration_s,
+                duration_s=taken_s,
             )
-    return make(duration_s), duration_s
-
-
-def plan_moves(context: SessionContext, run: str, path: Path, seed: int, duration_s: float) -> Plan:
-    """Make the moves of a run, their file, and a page that shows them.
-
-    Raises:
-        UsageError, ConfigurationInconsistent: there are no such moves.
-        OutputFailed: the file system refuses.
-    """
-    context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-    plan = write_plan(context, path, context.tools.plan(context.cell, seed=seed, duration_s=duration_s))
-    say_moves(context, run, path)
-    return plan
 
 
 def write_plan(context: SessionContext, path: Path, made: Plan) -> Plan:
@@ -526,18 +520,6 @@ def write_plan(context: SessionContext, path: Path, made: Plan) -> Plan:
 def say_moves(context: SessionContext, run: str, path: Path) -> None:
     """Say where the page is that shows the moves of a run."""
     context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html")))
-
-
-def refuse_geometry(found: Diagnosis | None) -> None:
-    """Refuse blocks that show another geometry than described; nothing is refused without a diagnosis.
-
-    Raises:
-        GeometryTurned: with the words of the diagnosis.
-    """
-    if found is None:
-        return
-    subject = ", ".join(found.axes) or "the mounting"
-    raise GeometryTurned(subject, found=found.found, expected=found.expected, remedy=found.remedy)
 
 
 def fit_corrected_command(cell_file: Path, session: Session) -> str:

@@ -140,8 +140,8 @@ SENTENCES = {
     "session taken up": "The session continues. Already recorded: {recorded}.",
     "an unfinished session is not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
     "drives are as declared, without fault and without power": "Checked: disk, history, interlock, drives.",
-    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. They take "
-    "{duration_s:g} s from now on.",
+    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. The "
+    "moves take {duration_s:g} s instead.",
     "moves to look at": "\nMoves to look at: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
     "recording is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is recorded again.",

@@ -38,7 +38,7 @@ from drivers.simulation.spec import CellSpec, ToggleBit
 
 BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
 PERIOD_US = 2000
-"""Of the cells here, in place of a millisecond: half as many frames say the same of a job."""
+"""Period of the cells here. A millisecond would be twice as many frames, and tests of a job need no more."""
 WHO = "the test's job"
 RUNS: tuple[dict[str, Any], ...] = (
     {"name": "bare-1"},

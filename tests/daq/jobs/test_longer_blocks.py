@@ -60,7 +60,7 @@ def test_blocks_are_twice_as_long_where_the_asked_duration_has_no_room(
     assert [(one["asked_s"], one["duration_s"]) for one in said] == [(6.0, 12.0), (12.0, 24.0)]
     sentence = SENTENCES["longer blocks"].format_map(said[0])
     assert sentence == (
-        "6 s of moves are too short: found room for 4 moves; expected at least 5. They take 12 s from now on."
+        "6 s of moves are too short: found room for 4 moves; expected at least 5. The moves take 12 s instead."
     )
 
 
