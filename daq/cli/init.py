@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from daq.cli.next_step import say_next
-from daq.cli.terminal import say, write_output
+from daq.cli.terminal import say, write_new_folder
 from daq.cli.verb import judged_output
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
@@ -39,24 +38,13 @@ def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ..
             expected="a name of letters, digits, . _ -",
             remedy="rename it",
         )
-    with write_output(folder):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(
-                str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
-            )
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{name}.") as temporary:
-            whole = Path(temporary) / name
-            written = tuple(
-                _copy(source, whole / target.format(name=name), name, texts) for source, target in TEMPLATES
-            )
-            if simulated:
-                cell = whole / "cells" / f"{name}.yaml"
-                text = cell.read_text(encoding="utf-8")
-                bus = re.compile(r"^bus:\n.*?(?=^axes:)", re.MULTILINE | re.DOTALL)
-                cell.write_text(bus.sub(texts["simulated_bus"], text), encoding="utf-8")
-            whole.chmod(0o755)
-            whole.rename(folder)
+    with write_new_folder(folder) as whole:
+        written = tuple(_copy(source, whole / target.format(name=name), name, texts) for source, target in TEMPLATES)
+        if simulated:
+            cell = whole / "cells" / f"{name}.yaml"
+            text = cell.read_text(encoding="utf-8")
+            bus = re.compile(r"^bus:\n.*?(?=^axes:)", re.MULTILINE | re.DOTALL)
+            cell.write_text(bus.sub(texts["simulated_bus"], text), encoding="utf-8")
     return tuple(folder / path.relative_to(whole) for path in written)
 
 

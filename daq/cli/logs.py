@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +18,7 @@ from daq.cli.terminal import (
     replace_output,
     say,
     status,
-    write_output,
+    write_new_folder,
 )
 from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
 from daq.environment import require_packages, software
@@ -81,30 +80,21 @@ def _extract_cell(log: Path, folder: Path) -> Path:
     from daq.config.same_cell import differing_sections
     from daq.log.reader import read_log
 
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(
-            str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
-        )
     head = read_log(log).head
     place, files = extracted_cell(head.files)
-    with write_output(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
-            whole = Path(temporary) / "cell"
-            for path, content in files.items():
-                target = whole / path
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(content)
-            differing = differing_sections(head.cell(log), load_cell(whole / place))
-            if differing:
-                raise OutputFailed(
-                    str(folder),
-                    found=f"another {', '.join(differing)} on reading back",
-                    expected="the description in the log",
-                    remedy="nothing was written; please report this log",
-                )
-            whole.chmod(0o755)
-            whole.rename(folder)
+    with write_new_folder(folder) as whole:
+        for path, content in files.items():
+            target = whole / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+        differing = differing_sections(head.cell(log), load_cell(whole / place))
+        if differing:
+            raise OutputFailed(
+                str(folder),
+                found=f"another {', '.join(differing)} on reading back",
+                expected="the description in the log",
+                remedy="nothing was written; please report this log",
+            )
     return folder / place
 
 

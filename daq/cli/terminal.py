@@ -56,6 +56,33 @@ def write_output(path: Path) -> Iterator[None]:
     WRITTEN.append(path)
 
 
+@contextmanager
+def write_new_folder(folder: Path) -> Iterator[Path]:
+    """Write a new folder within the block, all of it or nothing.
+
+    Yields:
+        a hidden folder beside it, to write into; it gets the name at the end of the block.
+
+    Raises:
+        UsageError: there is something in the folder, or a file of this name.
+        OutputFailed: the file system refuses.
+    """
+    from tempfile import TemporaryDirectory
+
+    with write_output(folder):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(
+                str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
+            )
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+            whole = Path(temporary) / "whole"
+            whole.mkdir()
+            yield whole
+            whole.chmod(0o755)
+            whole.rename(folder)
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all, within `replace_output`."""
     with replace_output(path):

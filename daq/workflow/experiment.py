@@ -174,9 +174,8 @@ class Experiment:
     payload: WeighedPayload  #: that will be mounted
     row_s: float  #: time between two rows of the observation [s]
     edge_s: float  #: how long after a standstill rows begin to count [s]
-    effort: (
-        FloatArray  #: limit of each axis' torque [Nm; N of a prismatic joint], inf where it is not known, shape (n,)
-    )
+    #: Torque limit of each axis [Nm; N of a prismatic joint], inf where it is not known, shape (n,).
+    effort: FloatArray
     remarks: tuple[str, ...]  #: what was assumed, in words
     mounted: tuple[int | None, ...] = RUNS  #: what is mounted at each repetition of the moves: payload or None
 
@@ -285,7 +284,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
 
 def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray) -> tuple[str, ...]:
     """Say which axes have no effort limit that moves could be kept below."""
-    lines = []
+    lines: list[str] = []
     unknown = [name for name, limit in zip(cell.axis_names, declared, strict=True) if np.isinf(limit)]
     if unknown:
         lines.append(f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there")

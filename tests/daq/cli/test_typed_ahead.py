@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,83 +16,72 @@ import pytest
 from daq.cli.calibrate import ask
 from daq.errors import JobHeld
 
-SECONDS_TO_WAIT = 20.0
+SECONDS_TO_WAIT = 20.0  #: For what takes milliseconds
+
+
+class SessionSide(io.TextIOWrapper):
+    """The session's side of a terminal, which tells when a line is waited for."""
+
+    def __init__(self, side: int) -> None:
+        super().__init__(io.BufferedReader(io.FileIO(side)), encoding="utf-8")
+        self.is_read = threading.Event()
+
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+        self.is_read.set()
+        return super().readline(size)
 
 
 @dataclass(frozen=True)
-class Keyboard:
-    """The operator's side of the terminal that the session reads."""
+class Terminal:
+    """A terminal with a person at it."""
 
-    side: int
+    operator_side: int
+    session_side: SessionSide
 
     def press(self, keys: str) -> None:
         """Type, and wait until the terminal shows it: then it is in the queue that the session reads."""
-        os.write(self.side, keys.encode())
+        os.write(self.operator_side, keys.encode())
         shown = b""
         while len(shown) < len(keys.replace("\n", "\r\n")):
-            shown += os.read(self.side, 100)
+            shown += os.read(self.operator_side, 100)
+
+    def answered(self, question: str, keys: str) -> str:
+        """Ask a question; type once it waits, and return what it takes for its answer."""
+        answers: list[str] = []
+        self.session_side.is_read.clear()
+        asking = threading.Thread(target=lambda: answers.append(ask(question)), daemon=True)
+        asking.start()
+        assert self.session_side.is_read.wait(SECONDS_TO_WAIT)
+        self.press(keys)
+        asking.join(SECONDS_TO_WAIT)
+        (answer,) = answers
+        return answer
 
 
 @pytest.fixture
-def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keyboard]:
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     """A terminal in the place of this process' input."""
     operator_side, session_side = pty.openpty()
-    with os.fdopen(session_side, encoding="utf-8") as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
-        yield Keyboard(operator_side)
+    with SessionSide(session_side) as side:
+        monkeypatch.setattr(sys, "stdin", side)
+        yield Terminal(operator_side, side)
     os.close(operator_side)
-
-
-class Asked(threading.Thread):
-    """A question that waits for its answer."""
-
-    def __init__(self, question: str) -> None:
-        super().__init__(daemon=True)
-        self.question = question
-        self.answer: str | None = None
-
-    def put(self, capsys: pytest.CaptureFixture[str]) -> str:
-        """Start it; return what is on the screen once it waits."""
-        self.start()
-        said = ""
-        deadline = time.monotonic() + SECONDS_TO_WAIT
-        while not said.endswith(": ") and time.monotonic() < deadline:
-            time.sleep(0.01)
-            said += capsys.readouterr().err
-        self.join(0.05)
-        assert self.is_alive(), f"answered already: {said}"
-        return said
-
-    def run(self) -> None:
-        self.answer = ask(self.question)
 
 
 @pytest.mark.parametrize("typed_ahead", ["\n", "\n\n\n", "yes\n", "4.59\n4.59\n", "no Enter yet"])
 def test_what_was_typed_before_a_question_does_not_answer_it(
-    keyboard: Keyboard, capsys: pytest.CaptureFixture[str], typed_ahead: str
+    terminal: Terminal, capsys: pytest.CaptureFixture[str], typed_ahead: str
 ) -> None:
-    keyboard.press(typed_ahead)
-    question = Asked("The robot moves now. Press Enter to start")
-    said = question.put(capsys)
-    keyboard.press("behind it\n")
-    question.join(SECONDS_TO_WAIT)
-    assert question.answer == "behind it"
-    said_so = "typed before this question does not count" in said
+    terminal.press(typed_ahead)
+    assert terminal.answered("The robot moves now: Enter starts it", "behind it\n") == "behind it"
+    said_so = "typed before this question does not count" in capsys.readouterr().err
     assert said_so == typed_ahead.endswith("\n")
 
 
-def test_two_questions_need_two_answers(keyboard: Keyboard, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_questions_need_two_answers(terminal: Terminal) -> None:
     """Enter twice at the first question leaves the second one open."""
-    first = Asked("Mount it, leave the cell, then press Enter")
-    first.put(capsys)
-    keyboard.press("\n\n")
-    first.join(SECONDS_TO_WAIT)
-    assert first.answer == ""
-    second = Asked("The robot moves now. Press Enter to start")
-    second.put(capsys)
-    keyboard.press("\n")
-    second.join(SECONDS_TO_WAIT)
-    assert second.answer == ""
+    assert terminal.answered("Leave the cell, press Enter", "first\nonce more\n") == "first"
+    assert terminal.answered("The robot moves now: Enter starts it", "second\n") == "second"
 
 
 def test_the_lines_of_a_pipe_are_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def test_the_files_are_those_of_the_log_with_the_same_digest(
     [
         ("tx40.urdf", ["demo.yaml", "drives/generic-cia402.yaml", "tx40.urdf"]),
         ("../../a/tx40.urdf", ["a/tx40.urdf", "cells/cells/demo.yaml", "cells/drives/generic-cia402.yaml"]),
-        ("/home/me/tx40.urdf", ["demo.yaml", "drives/generic-cia402.yaml", "robot.urdf"]),
+        ("/robots/tx40.urdf", ["demo.yaml", "drives/generic-cia402.yaml", "robot.urdf"]),
     ],
 )
 def test_each_file_is_where_the_cell_file_looks_for_it(
