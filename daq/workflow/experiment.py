@@ -285,11 +285,15 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
 def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray) -> tuple[str, ...]:
     """Say which axes have no effort limit that moves could be kept below."""
     lines: list[str] = []
-    unknown = [name for name, limit in zip(cell.axis_names, declared, strict=True) if np.isinf(limit)]
+    unknown: list[str] = []
+    refuted: list[str] = []
+    for name, of_urdf, limit in zip(cell.axis_names, declared, believed, strict=True):
+        if np.isinf(of_urdf):
+            unknown.append(name)
+        elif np.isinf(limit):
+            refuted.append(name)
     if unknown:
         lines.append(f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there")
-    is_refuted = np.isfinite(declared) & np.isinf(believed)
-    refuted = [name for name, refutes in zip(cell.axis_names, is_refuted, strict=True) if refutes]
     if refuted:
         lines.append(
             f"torque limits: gravity alone asks more than the `effort` of {', '.join(refuted)} in the URDF; not kept "

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import pairwise
+from itertools import compress, pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -293,8 +293,11 @@ class Search:
                 kept.append((moves, ways))
                 fresh |= new
         is_carried = self._is_carried(list(fresh.values()))
-        fresh = {way: path for (way, path), fits in zip(fresh.items(), is_carried, strict=True) if fits}
-        kept = [(moves, ways) for moves, ways in kept if all(way in known or way in fresh for way in ways)]
+        for way, fits in zip(tuple(fresh), is_carried, strict=True):
+            if not fits:
+                del fresh[way]
+        usable = known.keys() | fresh.keys()
+        kept = [(moves, ways) for moves, ways in kept if usable.issuperset(ways)]
         informations = self._experiment.informations(list(fresh.values()), THINNING)
         known |= {
             way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
@@ -343,7 +346,8 @@ class Search:
     def _is_carried(self, paths: Sequence[Trapezoid]) -> list[bool]:
         """Whether the drives can give the torque of each way, with a margin for what is not known of it."""
         shares = self._experiment.effort_shares(paths)
-        return [bool(fits) for fits in np.all(EFFORT_MARGIN * shares <= 1.0, axis=1)]
+        is_carried = np.all(EFFORT_MARGIN * shares <= 1.0, axis=1)
+        return list(map(bool, is_carried))
 
     def _random_move(self) -> PlannedMove:
         # Slow and fast moves both: friction is distinguished from inertia by moves of different speed and acceleration.
@@ -396,11 +400,15 @@ class Search:
 
     def _too_weak(self) -> list[str]:
         """Names of the axes whose drives cannot carry most of some slow random ways."""
-        moves = [_slower(self._random_move(), SLOWER[-1]) for _ in range(MAX_TRIES)]
-        paths = [path_of(self._cell, np.array(one.target_rad), two) for one, two in pairwise(moves)]
+        paths: list[Trapezoid] = []
+        start = np.array(self._random_move().target_rad)
+        for _ in range(MAX_TRIES):
+            move = _slower(self._random_move(), SLOWER[-1])
+            paths.append(path_of(self._cell, start, move))
+            start = np.array(move.target_rad)
         is_heavy = EFFORT_MARGIN * self._experiment.effort_shares(paths) > 1.0
-        often = np.mean(is_heavy, axis=0) > 0.5
-        return [name for name, is_weak in zip(self._cell.axis_names, often, strict=True) if is_weak]
+        is_often_heavy = np.mean(is_heavy, axis=0) > 0.5
+        return list(compress(self._cell.axis_names, is_often_heavy))
 
 
 def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:

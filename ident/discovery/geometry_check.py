@@ -107,7 +107,12 @@ class GeometryCheck:
     @property
     def certain_mistakes(self) -> tuple[Finding, ...]:
         """Mistakes that the data tell apart from every other correction."""
-        return tuple(one for one in self.mistakes if not any(alike.contain(one.placed) for alike in self.alike))
+        certain: list[Finding] = []
+        for mistake in self.mistakes:
+            has_rival = any(alike.contain(mistake.placed) for alike in self.alike)
+            if not has_rival:
+                certain.append(mistake)
+        return tuple(certain)
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,8 +48,10 @@ def effort_shares(
         motion: of the axes over k samples.
         payloads: mounted in turn, None without load.
     """
-    torques = [axis_torques(expectation, motion, payload) for payload in dict.fromkeys(payloads)]
-    largest = np.max(np.abs(torques), axis=0)
+    largest = np.zeros(motion.position_rad.T.shape)
+    for payload in dict.fromkeys(payloads):
+        torque = axis_torques(expectation, motion, payload)
+        largest = np.maximum(largest, np.abs(torque))
     return np.asarray(largest / effort[:, None])
 
 
