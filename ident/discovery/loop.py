@@ -147,25 +147,27 @@ def find_effects(
     Returns:
         the turns taken, one of each mistake first; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
-    gates, cache = gates or Gates(), ColumnCache()
-    model = linearised(start, cache)
+    gates = gates or Gates()
     names = axes or [joint.name for joint in start.model.robot.places]
     steps: list[Step] = []
     if mistakes is None:
         mistakes = _named_mistakes(start, rng, gates) if geometry else ()
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
     delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
+    described = start
     if corrections:
         progress("adding what the check of the description has named")
+        model = linearised(start, ColumnCache())
         corrected = join_mistakes(model, corrections, rng, gates)
         steps += _steps_of(corrected, mistakes, detection_limits_nm(model.search_problem, gates))
-        model = corrected.model
-    seen = {keys_of(start), keys_of(model.evidence)}
+        described = corrected.model.evidence
+        del model, corrected  # a linearised problem is large, and the search makes its own
+    seen = {keys_of(start), keys_of(described)}
 
-    def search(model: JointFit, most: int) -> tuple[list[Step], JointFit]:
-        return _searched(model, most, rng, gates, (*geometry, *families), seen, progress, names)
+    def search(start: Evidence, most: int) -> tuple[list[Step], JointFit]:
+        return _searched(start, most, rng, gates, (*geometry, *families), seen, progress, names)
 
-    found, model = search(model, MAX_EFFECTS)
+    found, model = search(described, MAX_EFFECTS)
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
         late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
@@ -173,14 +175,14 @@ def find_effects(
             *found, last = found  # a turn that has found nothing is the last one of all
             found += _steps_of(late, late.joined, last.limits_nm)
             seen.add(keys_of(late.model.evidence))
-            further, model = search(late.model, MAX_EFFECTS - len(found))
+            further, model = search(late.model.evidence, MAX_EFFECTS - len(found))
             found += further
     steps += found
     return (*steps[:-1], end_search(steps, model, gates, rng=rng))
 
 
 def _searched(
-    model: JointFit,
+    start: Evidence,
     most: int,
     rng: np.random.Generator,
     gates: Gates,
@@ -190,6 +192,7 @@ def _searched(
     names: Sequence[str],
 ) -> tuple[list[Step], JointFit]:
     """Take turns until one finds nothing, at most so many and at least one: the turns, and the model behind them."""
+    model = linearised(start, ColumnCache())
     steps: list[Step] = []
     for _ in range(max(most, 1)):
         step, joined = _turn(model, rng, gates, families, seen, progress, names)

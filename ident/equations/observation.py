@@ -107,10 +107,14 @@ class Observation(Equations):
             support |= demanded._support()
         columns = len(self.columns)
         flange = np.arange(columns, support.shape[1])
-        every = reduce_rows(
-            self, self._read_runs(demanded), support=support, flange=flange, instruments=demanded is not None
+        return reduce_rows(
+            self,
+            self._read_runs(demanded),
+            support=support,
+            flange=flange,
+            given=payload_values(self.payloads, self.payload_columns, columns),
+            instruments=demanded is not None,
         )
-        return every.holding(payload_values(self.payloads, self.payload_columns, columns))
 
     def _parts(self) -> list[FloatArray]:
         """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m, …, r)."""

@@ -11,7 +11,7 @@ separately for each mounting.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import with_demand
 from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, motor_columns, rows_of
-from ident.equations.system import Equations, System
+from ident.equations.system import Equations, GivenUnknowns, System
 from ident.equations.triangles import Triangles, qr_update, triangle
 from ident.errors import DataUnfit, JointStill
 from ident.model.base import SMALLEST_COLUMN, BaseParameters, base_parameters
@@ -118,6 +118,7 @@ def reduce_rows(
     *,
     support: BoolArray,
     flange: IntArray,
+    given: Mapping[int, float] | None = None,
     instruments: bool = False,
     compact: bool = False,
 ) -> System:
@@ -128,11 +129,12 @@ def reduce_rows(
         runs: read one after the other; their columns are those of ``unknowns``, and perhaps others for ``flange``.
         support: mask of the columns that each joint has, shape (m, c).
         flange: which columns are those of the link that carries the payload, shape (10,); none without payloads.
+        given: unknowns that get a value, as for `System.holding`, where all payloads are known beforehand.
         instruments: keep those of the demanded motion beside the rows.
         compact: reduce the motors' rows of a move to a triangle, and join moves where there are very many.
 
     Returns:
-        equations with all ten parameters of each payload among the unknowns, and no torque that is known.
+        equations with all ten parameters of each payload among the unknowns, but for those that are given.
 
     Raises:
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
@@ -144,7 +146,7 @@ def reduce_rows(
             reducer.clusters = _joined(reducer.clusters)
     if compact and len(reducer.clusters) > MAX_CLUSTERS:
         reducer.clusters = _joined(reducer.clusters)
-    return reducer.system()
+    return reducer.system({} if given is None else given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +224,23 @@ class _Reducer:
         ends = np.searchsorted(rows.move[used], moves[1:])
         return [own.T for own in np.split(columns, ends, axis=1)]
 
-    def system(self) -> System:
-        """The equations with all columns; those that a joint or motor does not have are zero."""
+    def system(self, given: Mapping[int, float]) -> System:
+        """The equations with all columns but those that are given; what a joint or motor does not have is zero."""
+        without_clusters = self._without_clusters()
+        unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
+        if given:
+            without_clusters = without_clusters.holding(given)
+        # The clusters are by far the largest part: none of them is held twice.
+        clusters: list[tuple[FloatArray, ...]] = []
+        instruments: list[tuple[FloatArray, ...]] = []
+        for one in self.clusters:
+            clusters.append(self._of_cluster(one, self._currents, unknowns, self.leading))
+            if self.has_demanded_motion:
+                instruments.append(self._of_cluster(one, self._instruments, unknowns, 0))
+        return replace(without_clusters, clusters=tuple(clusters), instruments=tuple(instruments))
+
+    def _without_clusters(self) -> System:
+        """The equations with all columns, before the rows of each cluster are added."""
         return System(
             model=self.model,
             base=self.unknowns.base,
@@ -233,9 +250,8 @@ class _Reducer:
             runs=tuple(self.names),
             joints=Triangles(tuple(map(self._joint, range(len(self.of_joint)))), self.joint_rows),
             motors=Triangles(tuple(map(self._motor, range(len(self.of_motor)))), self.motor_rows),
-            clusters=tuple(self._of_cluster(one, self._currents) for one in self.clusters),
+            clusters=(),
             cluster_runs=tuple((one.run, one.mounting) for one in self.clusters),
-            instruments=self._all_instruments(),
             preload=tuple(one.preload for one in self.clusters) if self.model.is_redundant else (),
         )
 
@@ -267,16 +283,19 @@ class _Reducer:
         """Number of the columns of [W | W_L of each mounting | 0]."""
         return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
 
-    def _all_instruments(self) -> tuple[tuple[FloatArray, ...], ...]:
-        """Instruments of each cluster; empty where the demanded motion of no run is known."""
-        if not self.has_demanded_motion:
-            return ()
-        return tuple(self._of_cluster(one, self._instruments) for one in self.clusters)
-
     def _of_cluster(
-        self, cluster: _Cluster, columns: Callable[[FloatArray, int, int], FloatArray]
+        self,
+        cluster: _Cluster,
+        columns: Callable[[FloatArray, int, int], FloatArray],
+        given: GivenUnknowns,
+        first: int,
     ) -> tuple[FloatArray, ...]:
-        return tuple(columns(rows, motor, cluster.mounting) for motor, rows in enumerate(cluster.factors))
+        """Rows of each motor: some columns of a cluster, so many of currents first, without those that are given."""
+        motors: list[FloatArray] = []
+        for motor, factor in enumerate(cluster.factors):
+            rows = columns(factor, motor, cluster.mounting)
+            motors.append(given.joined_in(rows, first))
+        return tuple(motors)
 
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.equations.currents import Currents, PreloadedCurrents
 from ident.equations.triangles import Triangles, singular_values, solve, triangle
 from ident.errors import DataUnfit, PayloadMissing, RankDeficient
@@ -51,6 +51,38 @@ class Equations:
             for payload, indices in zip(self.payloads, self.payload_columns, strict=True)
             for index in indices
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenUnknowns:
+    """Unknowns that get a value: their columns join W_kL χ_kL, the last one."""
+
+    kept: IntArray  #: columns that stay, the last one among them
+    given: IntArray  #: columns whose value is not zero
+    values: FloatArray  #: of these, shape (given,)
+
+    @classmethod
+    def of(cls, values: Mapping[int, float], count: int) -> GivenUnknowns:
+        """From values by index into so many unknowns."""
+        kept = [index for index in range(count + 1) if index not in values]
+        given = [index for index, value in values.items() if value]
+        return cls(
+            np.array(kept, dtype=np.int64),
+            np.array(given, dtype=np.int64),
+            np.array([values[index] for index in given]),
+        )
+
+    def joined_in(self, rows: FloatArray, first: int) -> FloatArray:
+        """Rows without the columns of these unknowns, whose torque joins the last column.
+
+        Args:
+            rows: of currents, unknowns and W_kL χ_kL, shape (r, first + count + 1).
+            first: number of columns of currents.
+        """
+        columns = np.concatenate((np.arange(first), first + self.kept))
+        joined = rows[:, columns]
+        joined[:, -1] += rows[:, first + self.given] @ self.values
+        return joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,19 +152,10 @@ class System(Equations):
         Args:
             values: by index into ``unknowns``; zero takes a parameter out of the model (paper §4.2).
         """
-        every = len(self.unknowns)
-        given = np.array([values.get(index, 0.0) for index in range(every)])
-        kept = [index for index in range(every + 1) if index not in values]
-
-        moved = np.flatnonzero(given)
-
-        def held(rows: FloatArray, first: int) -> FloatArray:
-            chosen = rows[:, [*range(first), *(first + index for index in kept)]]
-            chosen[:, -1] += rows[:, first + moved] @ given[moved]
-            return chosen
+        given = GivenUnknowns.of(values, len(self.unknowns))
 
         def folded(triangles: Triangles, first: int) -> Triangles:
-            factors = (held(factor, first) for factor in triangles.factors)
+            factors = (given.joined_in(factor, first) for factor in triangles.factors)
             return Triangles(tuple(triangle((f,), f.shape[1]) for f in factors), triangles.rows)
 
         payload_columns: list[tuple[int, ...]] = []
@@ -146,8 +169,8 @@ class System(Equations):
             payload_columns=tuple(payload_columns),
             joints=folded(self.joints, self.axis_count),
             motors=folded(self.motors, self.leading),
-            clusters=tuple(tuple(held(rows, self.leading) for rows in cluster) for cluster in self.clusters),
-            instruments=tuple(tuple(held(rows, 0) for rows in cluster) for cluster in self.instruments),
+            clusters=tuple(tuple(given.joined_in(rows, self.leading) for rows in cluster) for cluster in self.clusters),
+            instruments=tuple(tuple(given.joined_in(rows, 0) for rows in cluster) for cluster in self.instruments),
         )
 
     def on_instruments(self) -> System:
