@@ -115,18 +115,16 @@ def diagnose_fit(
     found: Identification,
     cell: Cell,
     recordings: Recordings,
-    instants: Sequence[Instants],
     geometry: GeometryFinding | None = None,
     *,
     corrected: bool = False,
 ) -> tuple[Diagnosis, ...]:
-    """Judge a fit by the recordings that it has used.
+    """Judge a fit in a right geometry by the recordings that it has used; `turned_geometry` is asked before.
 
     Args:
         found: with all effects.
         cell: description of its cell.
         recordings: of the fit.
-        instants: a few rows of each; taken from the logs where there are none.
         geometry: what the encoders say of the geometry; None for a robot without redundant ones.
         corrected: the fit is one with the corrected geometry.
 
@@ -135,9 +133,6 @@ def diagnose_fit(
         CurrentUnsigned: drives report the size of their currents only.
     """
     nameplate = nameplate_of(cell)
-    turned = turned_geometry(recordings, instants, found.training_error.total, found.model)
-    if turned is not None:
-        return (turned,)
     effort_limit = read_urdf(cell.urdf).effort_limit[list(robot_of(cell).axis_joints)]
     # Each held-out run is judged alone, as in a validation.
     named = diagnose(replace(found, holdout=None), cell.axis_names, nameplate, effort_limit)

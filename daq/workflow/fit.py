@@ -33,6 +33,7 @@ from daq.workflow.diagnoses import (
     named_causes,
     nameplate_of,
     open_correction_diagnoses,
+    turned_geometry,
 )
 from daq.workflow.geometry_diagnoses import encoder_misfit_of
 from daq.workflow.validate import Corrections, diagnose_log, with_described
@@ -366,6 +367,9 @@ def judged(fitted: Fit) -> Fit:
 
 def _with_diagnoses(fitted: Fit) -> Fit:
     """Return a fit with what is said of the logs that it used, or refuse it; held-out logs are not judged yet."""
+    turned = _turned_geometry_of(fitted)
+    if turned is not None:  # nothing else is said, and the description was tested in a wrong geometry
+        return replace(fitted, description=None, diagnoses=(turned,), is_holdout_judged=False)
     fitted = with_description(fitted)
     of_description = description_diagnoses(fitted)
     recordings = fitted.recordings
@@ -376,15 +380,28 @@ def _with_diagnoses(fitted: Fit) -> Fit:
         fitted.final,
         fitted.cell,
         recordings,
-        fitted.identification.instants,
         fitted.geometry,
         corrected=fitted.is_corrected,
     )
-    if any(one.name in GEOMETRY for one in of_fit):
-        fitted = replace(fitted, description=None)  # it rests on a wrong geometry
-    else:
-        of_fit = (*of_description, *of_fit)
-    return replace(fitted, diagnoses=of_fit, is_holdout_judged=False)
+    return replace(fitted, diagnoses=(*of_description, *of_fit), is_holdout_judged=False)
+
+
+def _turned_geometry_of(fitted: Fit) -> Diagnosis | None:
+    """Another geometry that explains the logs of a fit clearly better; None without any.
+
+    What a search adds does not turn the geometry, so that the answer of the fit before it holds where that is no.
+    """
+    has_searched = any(not step.declared for step in fitted.steps)
+    was_turned = any(one.name in GEOMETRY for one in fitted.diagnoses_before)
+    if has_searched and not was_turned:
+        return None
+    final = fitted.final
+    return turned_geometry(
+        fitted.recordings,
+        fitted.identification.instants,
+        final.training_error.total,
+        final.model,
+    )
 
 
 def _with_holdout_judged(fitted: Fit) -> Fit:

@@ -28,7 +28,7 @@ from ident.equations.system import System
 from ident.estimators.estimate import Estimate, Identification, RelativeError
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
-from ident.model.model import Model
+from ident.model.model import Column, Model
 
 RELINEARISATIONS = 4  #: Corrections of the geometry in one refit; a zero that is wrong by 2° settles in two
 SETTLED = 0.1  #: Share of σ below which a further correction is not worth its time
@@ -210,21 +210,42 @@ def fixed_gains(evidence: Evidence) -> FloatArray | None:
 
 def _refitted(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]) -> Evidence:
     """Refit with effects; the description has their corrections already."""
-    around, current, began_s = before, before, session_began_s(before.fit_runs)  # held-out runs must not affect the fit
-    fixed = fixed_gains(before)
-    joints = before.model.robot.places
-    columns = tuple(column.at(joints[placed.axis].kind) for placed in effects for column in placed.columns)
-    bare, unseen = _split_holdout(before.rows_without_effects, before.held_out)
-    for signals in (runs,) if all(placed.effect.abscissa.is_independent_of_model for placed in effects) else (runs, ()):
-        around, training = current, bare
-        if effects:
-            training = bare.extended(columns, _torques(effects, around, before.fit_runs, began_s, signals))
-        estimate = estimate_with(before.estimate.method, training.system(), fixed)
-        current = replace(before, training=training, holdout=unseen, effects=effects, estimate=estimate)
-    if unseen is None or not effects:
+    current = before
+    is_independent = all(placed.effect.abscissa.is_independent_of_model for placed in effects)
+    for signals in (runs,) if is_independent else (runs, ()):
+        around = current
+        current = refitted_around(around, effects, signals)
+    if current.holdout is None or not effects:
         return current
+    began_s = session_began_s(before.fit_runs)  # held-out runs must not affect the fit
     held_out = before.datasets[len(before.fit_runs) :]
-    return replace(current, holdout=unseen.extended(columns, _torques(effects, around, held_out, began_s)))
+    torque = _torques(effects, around, held_out, began_s)
+    return replace(current, holdout=current.holdout.extended(_columns_of(before.model, effects), torque))
+
+
+def refitted_around(around: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
+    """Refit the same data once; load and current of the effects' columns are predictions of the estimate before.
+
+    Args:
+        around: the same data and description.
+        effects: of the model. Held-out rows of the result do not have their columns.
+        runs: signals of the runs of the fit around the estimate before, where they are at hand.
+    """
+    training, unseen = _split_holdout(around.rows_without_effects, around.held_out)
+    if effects:
+        torque = _torques(effects, around, around.fit_runs, session_began_s(around.fit_runs), runs)
+        training = training.extended(_columns_of(around.model, effects), torque)
+    estimate = estimate_with(around.estimate.method, training.system(), fixed_gains(around))
+    return replace(around, training=training, holdout=unseen, effects=effects, estimate=estimate)
+
+
+def _columns_of(model: Model, effects: Sequence[PlacedEffect]) -> tuple[Column, ...]:
+    """Columns of effects at their joints."""
+    columns: list[Column] = []
+    for placed in effects:
+        kind = model.robot.places[placed.axis].kind
+        columns += [column.at(kind) for column in placed.columns]
+    return tuple(columns)
 
 
 def by_instruments(evidence: Evidence) -> Estimate | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ident.discovery.evidence import Evidence, by_instruments, with_effects
+from ident.discovery.evidence import Evidence, by_instruments, refitted_around
 from ident.discovery.gates import own_unknowns
 from ident.discovery.joining import UNFITTED
 from ident.effects.effect import PlacedEffect
@@ -64,9 +64,12 @@ def time_skew(evidence: Evidence) -> CurrentDelay | None:
 
 
 def _beside(evidence: Evidence, placed: PlacedEffect) -> CurrentDelay | None:
-    """Refit with the skew in the model, and judge it; None where it cannot be fitted."""
+    """Refit with the skew in the model, and judge it; None where it cannot be fitted.
+
+    One refit is enough: the torque whose rate is its column is that of a fit with everything else in the model.
+    """
     try:
-        refitted = with_effects(evidence, (*evidence.effects, placed))
+        refitted = refitted_around(evidence, (*evidence.effects, placed))
     except UNFITTED:
         return None
     return _judged(refitted, placed, is_in_model=False)
