@@ -15,6 +15,7 @@ from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import decimator
 from ident.model.robot import JointKind, Motion, Robot, poses
+from ident.planning.clear_way import farthest_towards
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.effort import believable_efforts, effort_shares
 from ident.planning.excitation import (
@@ -345,9 +346,6 @@ def _allowed(
     return np.array(found[1:])
 
 
-SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
-
-
 def towards(
     checker: Checker, start: FloatArray, target: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
@@ -358,7 +356,7 @@ def towards(
         start, target: positions of the axes [rad or m], shape (m,).
         lower, upper: limits of the axes, shape (m,).
     """
-    found = checker.farthest(start, start + np.array(SHARES)[:, None] * (target - start), lower, upper)
+    found = farthest_towards(checker, start, target, lower, upper)
     return start if found is None else found
 
 

@@ -41,6 +41,7 @@ from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
 from ident.model.robot import Robot
+from ident.planning.clear_way import clear_way
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
 from ident.planning.effort import EFFORT_MARGIN
 from ident.planning.excitation import Design
@@ -771,8 +772,16 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
 
 
-def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
-    """Refuse a way to the first target that leaves what the cell file declares.
+AROUND = 0.25
+"""Largest share of the limits at which a robot goes around what is in its way to the first target: no one has seen
+these moves before."""
+
+
+def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[tuple[PlannedMove, ...], str]:
+    """Return the moves before those of a plan that lead the robot around what is in its way, and a remark.
+
+    There are none where the straight way to the first target is clear. The others stay between the joint positions of
+    the plan and the one where the robot stands.
 
     Args:
         cell: with `workspace`, `clearance` or closures; without any, nothing is known of the room.
@@ -780,10 +789,38 @@ def check_approach(cell: Cell, plan: Plan, start_rad: FloatArray) -> None:
         start_rad: where the robot stands [rad; m of a prismatic joint], shape (n,).
 
     Raises:
-        MotionRefused: with the place and the bodies that come too close.
+        MotionRefused: no clear way was found; with the place and the bodies that come too close on the straight one.
     """
-    first = np.array(plan.moves[0].target_rad)
-    check_way(cell, start_rad, first, "the way from here to the first target of the plan")
+    if not _is_bounded(cell):
+        return (), ""
+    checker = _checker(cell)
+    first = plan.moves[0]
+    target = np.array(first.target_rad)
+    blocked = checker.obstruction(start_rad, target)
+    if blocked is None:
+        return (), ""
+    positions = np.array([start_rad, *(move.target_rad for move in plan.moves)])
+    lower = positions.min(axis=0)
+    upper = positions.max(axis=0)
+    turns = clear_way(checker, start_rad, target, lower, upper, np.random.default_rng(0))
+    if turns is None:
+        raise MotionRefused(
+            f"the way from here to the first target of the plan: found {_spell(cell, blocked)}, and no other clear way "
+            f"between the positions of the plan; bring the robot near the first target by hand, or correct "
+            f"{_keys(blocked)} in the cell file"
+        )
+    slow = replace(
+        first,
+        velocity=min(first.velocity, AROUND),
+        acceleration=min(first.acceleration, AROUND),
+        dwell_s=DWELL_S,
+    )
+    moves = tuple(replace(slow, target_rad=tuple(turn.tolist())) for turn in turns)
+    remark = (
+        f"the straight way from where the robot stood to the first target of the plan is not clear "
+        f"({_spell(cell, blocked)}): {len(moves)} slow moves led around it"
+    )
+    return moves, remark
 
 
 def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) -> None:
@@ -797,7 +834,7 @@ def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) 
     found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"{way}: found {_spell(cell, found)}; bring the robot near the first target by hand, or correct "
+            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, or correct "
             f"{_keys(found)} in the cell file"
         )
 

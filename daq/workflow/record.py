@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import JointLimits, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
-from daq.workflow.plan import Plan, check_approach, check_way
+from daq.workflow.plan import Plan, check_way, way_to_first_target
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
@@ -192,7 +192,7 @@ def record(
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
         start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
-        moves = _checked_moves(cell, request.plan, scale, start_counts, permission)
+        moves, around = _checked_moves(cell, request.plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         room.require(_log_bytes(cell, moves, start_counts, files))
         temperatures = polling.temperatures(clocks.wall_ns())
@@ -228,7 +228,7 @@ def record(
             raise short
         if other := network.other_master():
             warnings.append(f"{other}; it only read, but end that program before the next run")
-        warnings += (*remarks, *recovered, *polling.remarks)
+        warnings += (*remarks, *recovered, *around, *polling.remarks)
         return Recorded(out, log.statistics, stream.statistics, tuple(warnings))
 
 
@@ -551,16 +551,17 @@ def _start(
 
 def _checked_moves(
     cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int], permission: MotionPermission
-) -> tuple[Move, ...]:
-    """Convert a plan to motor moves that keep the limits, and whose first way is clear.
+) -> tuple[tuple[Move, ...], tuple[str, ...]]:
+    """Convert a plan to motor moves that keep the limits, behind those to its first target, and remarks about these.
 
     Raises:
-        MotionRefused: they do not.
+        MotionRefused: they do not keep the limits, or no way to the first target is clear.
     """
-    check_approach(cell, plan, scale.joint_position(np.array(start_counts)))
-    moves = motor_moves(cell, plan, scale, start_counts)
+    before, remark = way_to_first_target(cell, plan, scale.joint_position(np.array(start_counts)))
+    whole = replace(plan, moves=(*before, *plan.moves))
+    moves = motor_moves(cell, whole, scale, start_counts)
     check_moves(start_counts, moves, permission, cell.axis_names)
-    return moves
+    return moves, (remark,) if remark else ()
 
 
 def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:

@@ -184,7 +184,7 @@ class Checker:
         return None
 
     def farthest(self, start: FloatArray, ends: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
-        """Choose the first of some ends that a closed chain can go to; None where it can go to none.
+        """Choose the first of some ends that the robot can go to; None where it can go to none.
 
         Args:
             start, lower, upper: positions of the axes [rad or m], shape (m,).
@@ -193,6 +193,8 @@ class Checker:
         """
         ends = self.fitting(ends)
         inside = np.all((ends >= lower) & (ends <= upper), axis=1)
+        if not self.robot.closures:
+            return next((end for end in ends[inside] if self.obstruction(start, end) is None), None)
         found = self._ways(np.broadcast_to(start, ends.shape), ends)
         clear = (
             end for end, within, obstruction in zip(ends, inside, found, strict=True) if within and not obstruction

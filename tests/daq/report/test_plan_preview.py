@@ -18,8 +18,7 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.report.plan_preview import STEP_S, find_preview, preview_data, preview_page
 from daq.workflow.experiment import PlannedMove, experiment_duration_s, scene_of
-from daq.workflow.plan import Plan, check_approach
-from drivers.errors import MotionRefused
+from daq.workflow.plan import Plan
 from ident.model.robot import poses
 from ident.planning.clearance import BASE, Box, Checker
 
@@ -126,14 +125,3 @@ def test_a_preview_is_found_by_the_content_of_its_plan(cell: Cell, checker: Chec
     assert find_preview(plan) == tmp_path / "look.html"
     plan.write_bytes(b"other moves")
     assert find_preview(plan) is None
-
-
-def test_a_way_to_the_first_target_through_a_wall_is_refused(cell: Cell) -> None:
-    """The arm, stretched forward, swings about J1 from one side of the wall to the other."""
-    aside = np.array([1.2, 1.5, 0.0, 0.0, 0.0, 0.0])
-    through = replace(PLAN, moves=(replace(MOVES[0], target_rad=(-1.2, *aside[1:].tolist())),))
-    with pytest.raises(MotionRefused, match=r"first target of the plan: found -?\d+ mm between .* and wall at"):
-        check_approach(cell, through, aside)
-    check_approach(replace(cell, clearance=None), through, aside)
-    same_side = replace(PLAN, moves=(replace(MOVES[0], target_rad=(1.0, *aside[1:].tolist())),))
-    check_approach(cell, same_side, aside)

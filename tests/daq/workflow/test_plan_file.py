@@ -17,7 +17,7 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
-from daq.workflow.plan import Plan, check_approach, load_plan, plan, save_plan
+from daq.workflow.plan import Plan, load_plan, plan, save_plan, way_to_first_target
 from drivers.errors import MotionRefused
 from ident.planning.clearance import Box
 
@@ -65,9 +65,9 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
         "  - {target_deg: [0, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.1}\n"
     )
     path.write_text(text)
-    check_approach(cell, load_plan(path, cell), np.radians([0.3, 0.0, 0.0, 0.0]))
+    assert way_to_first_target(cell, load_plan(path, cell), np.radians([0.3, 0.0, 0.0, 0.0])) == ((), "")
     with pytest.raises(MotionRefused, match=r"the loops do not close, or are close to a singularity, at .*closures"):
-        check_approach(cell, load_plan(path, cell), np.radians([0.0, 8.0, 0.0, 0.0]))
+        way_to_first_target(cell, load_plan(path, cell), np.radians([0.0, 8.0, 0.0, 0.0]))
     path.write_text(text + "  - {target_deg: [0, 12, 0, 0], velocity: 0.5, acceleration: 0.5}\n")
     with pytest.raises(ConfigurationInconsistent, match=r"moves\[1\], on the way there: found that the loops do not"):
         load_plan(path, cell)

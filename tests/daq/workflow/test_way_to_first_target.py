@@ -1,0 +1,84 @@
+"""From where the robot stands to the first target of a plan: straight, around what is in the way, or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.workspace import Clearance
+from daq.workflow.experiment import PlannedMove, scene_of
+from daq.workflow.plan import AROUND, Plan, plan, way_to_first_target
+from drivers.errors import MotionRefused
+from ident.model.urdf import robot_from_urdf
+from ident.planning.clearance import Box, Checker
+
+LEFT = (1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: The arm, stretched forward, beside a wall in front of it
+RIGHT = (-1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: On its other side: the straight way there swings through it
+ABOVE = (0.0, -0.5, 0.0, 0.0, 0.0, 0.0)
+MOVE = PlannedMove(RIGHT, 0.9, 0.8, 0.5)
+
+
+@pytest.fixture(scope="module")
+def walled(checkout: Path) -> Cell:
+    """The demo cell with a wall in front of the arm."""
+    wall = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
+    return replace(load_cell(checkout / "configs/cells/demo.yaml"), clearance=Clearance(None, 0.02, (), (wall,)))
+
+
+def _plan_to(*targets: tuple[float, ...]) -> Plan:
+    moves = tuple(replace(MOVE, target_rad=target) for target in targets)
+    return Plan("demo", 1, 100.0, (), 1.0, moves, ())
+
+
+def test_a_clear_straight_way_needs_no_further_move(walled: Cell) -> None:
+    beside = (1.0, *LEFT[1:])
+    assert way_to_first_target(walled, _plan_to(beside), np.array(LEFT)) == ((), "")
+
+
+def test_nothing_is_asked_where_the_cell_file_says_nothing_of_the_room(walled: Cell) -> None:
+    bare = replace(walled, clearance=None)
+    assert way_to_first_target(bare, _plan_to(RIGHT), np.array(LEFT)) == ((), "")
+
+
+def test_a_wall_that_no_position_of_the_plan_leads_around_is_refused(walled: Cell) -> None:
+    """All targets of the plan are as high as the wall."""
+    with pytest.raises(MotionRefused, match=r"found -?\d+ mm between .* and wall at .*, and no other clear way"):
+        way_to_first_target(walled, _plan_to(RIGHT), np.array(LEFT))
+
+
+def test_slow_moves_lead_around_a_wall_between_the_positions_of_the_plan(walled: Cell) -> None:
+    plan_ = _plan_to(RIGHT, ABOVE)
+    moves, remark = way_to_first_target(walled, plan_, np.array(LEFT))
+    assert moves
+    robot = robot_from_urdf(walled.urdf)
+    scene = scene_of(walled, robot, 1.0).checker.scene
+    checker = Checker(robot, replace(scene, pairs=()))  # that a guessed arm touches itself refuses nothing
+    way = np.array([LEFT, *(move.target_rad for move in moves), RIGHT])
+    for start, end in pairwise(way):
+        assert checker.obstruction(start, end) is None
+    corners = np.array([LEFT, RIGHT, ABOVE])
+    assert np.all(way >= corners.min(axis=0))
+    assert np.all(way <= corners.max(axis=0))
+    assert {(move.velocity, move.acceleration) for move in moves} == {(AROUND, AROUND)}
+    assert remark.endswith(f"{len(moves)} slow moves led around it")
+
+
+def test_the_next_plan_of_a_closed_chain_begins_where_the_last_one_ended(checkout: Path) -> None:
+    """Between random positions the loops of the DualV do not stay closed on a straight way of its motors."""
+    cell = load_cell(checkout / "configs/cells/dualv.yaml")
+    plans = [
+        plan(cell, seed=seed, duration_s=5.0, exchanges=0, largest_condition=np.inf, largest_std_percent=np.inf)
+        for seed in (1, 2, 3)
+    ]
+    around = [way_to_first_target(cell, after, _end_of(before))[0] for before, after in pairwise(plans)]
+    assert any(around)
+
+
+def _end_of(plan_: Plan) -> np.ndarray:
+    return np.array(plan_.moves[-1].target_rad)
