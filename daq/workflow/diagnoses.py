@@ -50,7 +50,14 @@ from ident.discovery.loop import Step
 from ident.discovery.search import Finding
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Lag, TimeSkew
-from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset, is_correction, turned_gravity
+from ident.effects.geometry_corrections import (
+    GravityDirection,
+    LatePosition,
+    ZeroOffset,
+    is_correction,
+    turned_gravity,
+    turned_gravity_std,
+)
 from ident.equations.instants import Instants, read_instants
 from ident.equations.system import System
 from ident.errors import (
@@ -62,6 +69,7 @@ from ident.errors import (
     ModelContradicted,
     NotConverged,
     PayloadUnseen,
+    RankDeficient,
     TooFewMoves,
 )
 from ident.estimators.diagnosis import (
@@ -292,17 +300,17 @@ def is_checked(logs: Sequence[Path]) -> bool:
 
 
 def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
-    """Test the geometry beside a fit by any estimator; None with too few moves.
+    """Test the geometry beside a fit by any estimator; None with too few moves, or where ``ml`` fits nothing.
 
     Args:
         evidence: the rows behind the fit.
         seed: of the bootstrap.
     """
-    if evidence.estimate.method is not Method.ML:
-        evidence = replace(evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system()))
     try:
+        if evidence.estimate.method is not Method.ML:
+            evidence = replace(evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system()))
         return check_geometry(evidence, np.random.default_rng(seed))
-    except TooFewMoves:
+    except (NotConverged, RankDeficient, TooFewMoves):
         return None
 
 
@@ -567,7 +575,8 @@ def _correction_diagnosis(
         case _:
             declared = model.robot.gravity_m_s2
             found_m_s2 = turned_gravity(declared, values.tolist())
-            turned = vector_text(suggested_gravity(found_m_s2, float(np.max(deviations))))
+            std_m_s2 = turned_gravity_std(declared, found_m_s2, deviations.tolist())
+            turned = vector_text(suggested_gravity(found_m_s2, std_m_s2))
             found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
             expected = f"{vector_text(declared)}, as the cell file says"
             remedy = (

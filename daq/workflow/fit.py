@@ -436,19 +436,24 @@ def _with_description_after_search(closed: Fit) -> Fit:
     if description is None or not description.mistakes:
         return closed
     after = closed.steps[-1].after
-    if all(mistake.placed in after.effects for mistake in description.mistakes):
+    # Of a delay, the setting of its filter is fitted: the same effect has another one in the model.
+    corrected = {(placed.effect.name, placed.axis) for placed in after.effects}
+    if all((mistake.effect.name, mistake.axis) in corrected for mistake in description.mistakes):
         return replace(closed, description=replace(description, mistakes=()))
     if len(after.effects) == after.declared:  # the model is the one beside which they were named
         return closed
     beside = geometry_beside(after, BOOTSTRAP_SEED)
     if beside is None:
         return replace(closed, description=replace(description, mistakes=()))
-    # Gravity and hidden zeros stay those of the fit; mistakes and their company are those of the final model.
+    # Gravity and hidden zeros stay those of the fit, and what it did not tell apart from a correction that the search
+    # has made. Mistakes and their company are those of the final model.
+    unclear = [alike for alike in description.alike if any(map(alike.contain, after.effects))]
     kept = replace(
         beside,
         gravity=description.gravity,
         hidden_zeros=description.hidden_zeros,
         hidden_pairs=description.hidden_pairs,
+        alike=(*unclear, *beside.alike),
     )
     return replace(closed, description=kept)
 
@@ -603,6 +608,7 @@ def _with_geometry_of_encoders(start: Fit) -> Fit:
         steps=steps,
         paper=None if described.gains_fixed else tls(last.system),
         geometry_covariance=covariance,
+        description=None,  # it was tested in the described geometry
     )
 
 

@@ -24,7 +24,7 @@ from ident.arrays import FloatArray
 from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
-from ident.discovery.gates import Gates, impossible, in_noise, own_unknowns
+from ident.discovery.gates import Gates, impossible, in_noise, is_certain_delay, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import (
     Delay,
@@ -315,7 +315,7 @@ def _all_alike(
         if beside is None:
             try:
                 beside = _ranked_beside(evidence, others, rng, gates)
-            except UNFITTED:
+            except (*UNFITTED, TooFewMoves):  # of the corrected description, other moves may be valid
                 continue
         alike = _alike(beside, mistake)
         if alike:
@@ -337,6 +337,7 @@ def _ranked_beside(
 
     Raises:
         NotConverged, RankDeficient: see `ident.identify`.
+        TooFewMoves: there are too few moves to leave some out.
     """
     beside = with_effects(evidence, (*evidence.effects, *others))
     problem = _problem_at_rows(beside)
@@ -377,6 +378,9 @@ def _suspects(
     suspects: list[_Suspect] = []
     passed = [found for found in findings if found.passed]
     for found in passed:
+        is_late = isinstance(found.effect, LatePosition)
+        if is_late and not is_certain_delay(found.coefficients, found.deviations):
+            continue
         if not isinstance(found.effect, Delay):
             torque_nm = problem.torque_at_rows(found.effect, found.axis)
             suspects.append(_Suspect((found.placed,), torque_nm, found.coefficients, found.held_out_fall))

@@ -24,11 +24,13 @@ from ident.discovery.evidence import (
     with_first_order_effects,
 )
 from ident.discovery.gates import (
+    CERTAIN_DELAY_SIGMAS,
     Gates,
     PartsLeftOut,
     gain_shifts,
     impossible,
     in_noise,
+    is_certain_delay,
     moved_gains,
     own_unknowns,
     runs_to_leave_out,
@@ -43,7 +45,7 @@ from ident.discovery.search import EffectKey, Finding, effect_key, is_better, ra
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import SpeedFriction
-from ident.effects.geometry_corrections import is_correction
+from ident.effects.geometry_corrections import LatePosition, is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
@@ -314,7 +316,9 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
 
 def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
-    if isinstance(placed.effect, Delay):
+    is_delay = isinstance(placed.effect, Delay | LatePosition)
+    sizes = gates
+    if is_delay:
         # A delay is judged by its length: beside dry friction it is a small part of a motor's residual.
         gates = replace(gates, explained=0.0, error_fall=0.0)
     estimate = model.evidence.estimate
@@ -330,8 +334,13 @@ def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generato
     values = values_of(estimate, own)
     place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
-    physics = impossible(placed.effect.coefficients, values, estimate.parameters_std[own])
+    deviations = estimate.parameters_std[own]
+    is_small = finding.explained < sizes.explained or finding.error_fall < sizes.error_fall
+    uncertain = ""
+    if is_delay and is_small and not is_certain_delay(values, deviations):
+        uncertain = f"it explains little, and is less than {CERTAIN_DELAY_SIGMAS:g} σ from zero"
+    physics = impossible(placed.effect.coefficients, values, deviations)
     is_of_speed = isinstance(placed.effect, SpeedFriction)
     drives = pushing(model.evidence, placed.axis) if is_of_speed else ""
-    reasons = (*finding.refusals, joint, physics, drives, PartsLeftOut.of(problem).refusal(columns))
+    reasons = (*finding.refusals, joint, uncertain, physics, drives, PartsLeftOut.of(problem).refusal(columns))
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))

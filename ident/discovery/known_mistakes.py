@@ -70,14 +70,29 @@ def join_mistakes(
         if needless is not None:
             kept = tuple(placed for placed in kept if placed != needless)
             continue
-        partial = [_with_mistakes(model, kept, left[:count]) for count in range(1, len(left))]
         return JoinedMistakes(
             model=joined,
             joined=tuple(as_joined(one, evidence) for one in left),
-            models=(*partial, evidence),
+            models=_growing_models(model, kept, left, evidence),
             set_aside=tuple(aside),
         )
     return JoinedMistakes(model, (), (), tuple(aside))
+
+
+def _growing_models(
+    model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Sequence[Finding], last: Evidence
+) -> tuple[Evidence, ...]:
+    """Models with the first of some mistakes, the first two, and so on to the last one, which is given.
+
+    Of two zeros that hide each other, one alone may not be fitted: then the model with both stands for it, too.
+    """
+    models = [last]
+    for number in reversed(range(1, len(mistakes))):
+        try:
+            models.append(_with_mistakes(model, kept, mistakes[:number]))
+        except UNFITTED:
+            models.append(models[-1])
+    return tuple(reversed(models))
 
 
 def _worst_of_model(

@@ -16,6 +16,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem
 from ident.discovery.evidence import Evidence, coefficients_of, with_effects
+from ident.discovery.gates import CERTAIN_DELAY_SIGMAS
 from ident.effects.effect import PlacedEffect, at_joints
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.signals import fitted_signals, session_began_s
@@ -23,7 +24,6 @@ from ident.equations.rows import decimate_rows
 
 Delay = Lag | TimeSkew
 
-CERTAIN_SIGMAS = 4.0  #: By which the delay of a motor must differ from zero to be named
 ALIKE_SIGMAS = 2.5  #: Within which a delay is the common one
 ALIKE_SHARE = 1.0 / 3.0  #: Of the common delay, within which a delay is the common one, too: filters differ a little
 REFITS = 4  #: Refits with the filter of the delays found; see `ident.discovery.time_skew`
@@ -114,7 +114,9 @@ def find_late_currents(
         return None
     seconds = trial.coefficients
     covariance = trial.covariance
-    if skews and _are_alike(seconds, covariance):
+    # Of fewer currents, nothing says that the others are late by the same time.
+    are_all_tested = 2 <= len(lags) == problem.axes
+    if skews and are_all_tested and _are_alike(seconds, covariance):
         effect, of_skew = skews[0].members[0]
         placed = PlacedEffect(effect, skews[0].axis)
         return LateCurrents(
@@ -123,7 +125,7 @@ def find_late_currents(
             seconds=of_skew.coefficients,
             held_out=of_skew.held_out.sum(axis=1),
         )
-    late = np.flatnonzero(np.abs(seconds) > CERTAIN_SIGMAS * np.sqrt(np.diag(covariance)))
+    late = np.flatnonzero(np.abs(seconds) > CERTAIN_DELAY_SIGMAS * np.sqrt(np.diag(covariance)))
     if not len(late):
         return None
     own = columns[:, late]

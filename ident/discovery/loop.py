@@ -107,7 +107,8 @@ def find_effects(
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
     Mistakes of the description that a check names join first, and delays that it names behind the search
-    (`check_geometry`, `join_mistakes`). Each turn of the loop:
+    (`check_geometry`, `join_mistakes`); what of them does not join is set aside in the last turn. Each turn of the
+    loop:
 
     1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every axis: its columns,
        made from the motion and the predicted load and current, are projected off all declared directions, and the fall
@@ -145,7 +146,8 @@ def find_effects(
         mistakes: that the check has named beside this start; when None, and there is a geometry, it is made here.
 
     Returns:
-        the turns taken, one of each mistake first; the last one has accepted nothing, unless MAX_EFFECTS was reached.
+        the turns taken, one of each mistake that has joined among them; the last one has accepted nothing, unless
+        MAX_EFFECTS was reached.
     """
     gates = gates or Gates()
     names = axes or [joint.name for joint in start.model.robot.places]
@@ -155,11 +157,13 @@ def find_effects(
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
     delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
     described = start
+    aside: list[SetAside] = []
     if corrections:
         progress("adding what the check of the description has named")
         model = linearised(start, ColumnCache())
         corrected = join_mistakes(model, corrections, rng, gates)
         steps += _steps_of(corrected, mistakes, detection_limits_nm(model.search_problem, gates))
+        aside += corrected.set_aside
         described = corrected.model.evidence
         del model, corrected  # a linearised problem is large, and the search makes its own
     seen = {keys_of(start), keys_of(described)}
@@ -171,6 +175,7 @@ def find_effects(
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
         late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
+        aside += late.set_aside
         if late.joined:
             *found, last = found  # a turn that has found nothing is the last one of all
             found += _steps_of(late, late.joined, last.limits_nm)
@@ -178,7 +183,9 @@ def find_effects(
             further, model = search(late.model.evidence, MAX_EFFECTS - len(found))
             found += further
     steps += found
-    return (*steps[:-1], end_search(steps, model, gates, rng=rng))
+    last = end_search(steps, model, gates, rng=rng)
+    not_joined = [one for one in aside if one.finding.placed not in last.after.effects]
+    return (*steps[:-1], replace(last, set_aside=(*not_joined, *last.set_aside)))
 
 
 def _searched(
@@ -218,10 +225,10 @@ def _named_mistakes(start: Evidence, rng: np.random.Generator, gates: Gates) -> 
 
 
 def _steps_of(corrected: JoinedMistakes, mistakes: Sequence[Finding], limits_nm: FloatArray) -> list[Step]:
-    """A turn for each mistake that has joined."""
+    """A turn for each mistake that has joined; the check has told it apart from everything else."""
     steps: list[Step] = []
     for found, after in zip(corrected.joined, corrected.models, strict=True):
-        steps.append(Step(tuple(mistakes), (), limits_nm, found, after, corrected.set_aside))
+        steps.append(Step(tuple(mistakes), (), limits_nm, replace(found, ambiguity=()), after))
     return steps
 
 

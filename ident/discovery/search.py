@@ -33,11 +33,11 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
-from ident.discovery.gates import SIGMAS, Gates, impossible
+from ident.discovery.gates import SIGMAS, Gates, impossible, is_certain_delay
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
-from ident.effects.geometry_corrections import GeometryEffect
+from ident.effects.geometry_corrections import GeometryEffect, LatePosition
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -261,7 +261,10 @@ def _judge(
     error_before, error_after = (float(np.sqrt(part[:, motor].sum() / size)) for part in (before, after))
     error_fall = 1.0 - error_after / error_before
     folds_better = float(np.mean(fall > 0))
-    is_geometry = isinstance(effect, GeometryEffect)
+    # A small mistake of the geometry is spread over all motors, and bends their gains.
+    may_be_small = isinstance(effect, GeometryEffect)
+    if isinstance(effect, LatePosition):
+        may_be_small = is_certain_delay(trial.coefficients, trial.deviations)
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
     false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
     chance = None if np.isnan(probability[best]) else float(probability[best])
@@ -274,13 +277,12 @@ def _judge(
     verdicts = (
         (may_be_noise, by_chance),
         (folds_better < gates.folds_better, f"it is better on {100 * folds_better:.0f} % of the folds only"),
-        # A small mistake of the geometry is spread over all motors, and bends their gains.
         (
-            explained < gates.explained and not is_geometry,
+            explained < gates.explained and not may_be_small,
             f"it explains {100 * explained:.1f} % of the squared residual only",
         ),
         (
-            error_fall < gates.error_fall and not is_geometry,
+            error_fall < gates.error_fall and not may_be_small,
             f"the error on left-out moves changes by {-100 * error_fall:+.1f} % only",
         ),
         (fall.sum() <= 0.0, "the error on left-out moves does not fall"),

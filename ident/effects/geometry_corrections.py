@@ -285,6 +285,21 @@ def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> Floa
     return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
 
 
+def turned_gravity_std(
+    declared_m_s2: FloatArray, turned_m_s2: FloatArray, deviations_rad: Sequence[float]
+) -> FloatArray:
+    """σ of each component of gravity, from those of the two components of its turn [m/s²], shape (3,).
+
+    To first order a small further turn t about an axis moves gravity by t × g; the two σ may differ, because the moves
+    may show one of the turns alone.
+    """
+    changes = [
+        deviation * np.cross(axis, turned_m_s2)
+        for axis, deviation in zip(across(declared_m_s2), deviations_rad, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(changes, axis=0))
+
+
 def turn_between(declared_m_s2: FloatArray, found_m_s2: FloatArray) -> FloatArray:
     """The two components of the turn from one direction of gravity to another, as of `turned_gravity`, shape (2,)."""
     axis = np.cross(declared_m_s2, found_m_s2)

@@ -172,7 +172,8 @@ class TurnedGeometry:
         others = f"; explained as well by {' or '.join(alike)}" if alike else ""
         if self.gravity is not None:
             found = self.gravity
-            suggested_m_s2 = suggested_gravity(found.found_m_s2, float(np.deg2rad(found.std_deg)))
+            std_m_s2 = float(np.linalg.norm(found.found_m_s2) * np.deg2rad(found.std_deg))
+            suggested_m_s2 = suggested_gravity(found.found_m_s2, np.full(3, std_m_s2))
             remedy = (
                 f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(suggested_m_s2)} m/s² by "
                 f"these recordings; {until_right}"

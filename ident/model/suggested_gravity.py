@@ -17,24 +17,24 @@ MOST_DECIMALS = 4  #: Of m/s²
 FEWEST_DECIMALS = 2
 
 
-def suggested_gravity(found_m_s2: FloatArray, std_rad: float) -> FloatArray:
+def suggested_gravity(found_m_s2: FloatArray, std_m_s2: FloatArray) -> FloatArray:
     """Return gravity of the same size, rounded to what its σ supports, and along an axis where that is within 2 σ.
 
     Args:
         found_m_s2: as it was estimated, shape (3,).
-        std_rad: σ of its direction.
+        std_m_s2: σ of each component, shape (3,).
 
     Returns:
         gravity [m/s²], shape (3,).
     """
     size = float(np.linalg.norm(found_m_s2))
-    std_m_s2 = size * std_rad
     shown = np.abs(found_m_s2) > ZERO_SIGMAS * std_m_s2
     shown[np.argmax(np.abs(found_m_s2))] = True
     kept = np.where(shown, found_m_s2, 0.0)
     kept *= size / np.linalg.norm(kept)
     decimals = MOST_DECIMALS
-    if np.count_nonzero(shown) > 1 and std_m_s2 > 0.0:
-        of_std = -math.floor(math.log10(std_m_s2))
+    largest_std_m_s2 = float(np.max(std_m_s2[shown]))
+    if np.count_nonzero(shown) > 1 and largest_std_m_s2 > 0.0:
+        of_std = -math.floor(math.log10(largest_std_m_s2))
         decimals = min(MOST_DECIMALS, max(FEWEST_DECIMALS, of_std))
     return np.asarray(np.round(kept, decimals) + 0.0)  # no minus before a zero

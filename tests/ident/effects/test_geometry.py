@@ -24,6 +24,7 @@ from ident.effects.geometry_corrections import (
     rotation_by,
     shifted,
     turned_gravity,
+    turned_gravity_std,
 )
 from ident.effects.signals import declared_signals
 from ident.model.model import Model
@@ -116,6 +117,20 @@ def test_gravity_keeps_its_length_and_is_found_again(
     assert np.linalg.norm(turned) == pytest.approx(9.81)
     angle = np.arccos(np.clip(turned @ declared / 9.81**2, -1.0, 1.0))
     assert angle == pytest.approx(np.linalg.norm(turn), abs=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    direction=st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1),
+    deviations=st.tuples(*[st.floats(0.0, 0.01)] * 2),
+)
+def test_components_of_gravity_scatter_as_their_deviations_say(
+    direction: tuple[float, float, float], deviations: tuple[float, float]
+) -> None:
+    declared = 9.81 * np.array(direction) / np.linalg.norm(direction)
+    ends = [turned_gravity(declared, [deviations[0], 0.0]), turned_gravity(declared, [0.0, deviations[1]])]
+    moved = np.linalg.norm([end - declared for end in ends], axis=0)
+    assert turned_gravity_std(declared, declared, deviations) == pytest.approx(moved, abs=1e-3)
 
 
 def test_values_between_samples_are_interpolated_and_ends_stay() -> None:
