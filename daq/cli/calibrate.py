@@ -120,9 +120,10 @@ class Person:
             ask("The robot moves now: Enter starts it, Ctrl-C stops")
         return self.who
 
-    def record_again(self, run: PlannedRun, mistake: str) -> bool:
-        """Ask whether a block with a mistake is recorded again; `keep` keeps it."""
-        return ask(f"Press Enter to record it again, or type {KEEP} to keep {run.name} as it is") != KEEP
+    def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
+        """Ask whether blocks with a mistake are recorded again; `keep` keeps them."""
+        them = "it" if len(blocks) == 1 else f"these {len(blocks)} blocks"
+        return ask(f"Press Enter to record {them} again, or type {KEEP} to keep {run.name} as it is") != KEEP
 
     def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""

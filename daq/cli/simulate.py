@@ -69,7 +69,8 @@ def simulate(
     from drivers.simulation.spec import SpecInvalid
 
     at_most_one(payload_from=payload_from, payload=payload)
-    shipped = simulation.name in SHIPPED and not simulation.exists()
+    # A folder of that name, as `init` makes it, is no simulation file.
+    shipped = simulation.name in SHIPPED and not simulation.is_file()
     truth = shipped_simulation(simulation.name) if shipped else simulation
     mounted = None
     if payload_from is not None:
@@ -80,7 +81,7 @@ def simulate(
         )
     spec = load_simulation(truth, payload) if mounted is None else mounted.at_power_on()
     if faults is not None:
-        shipped = faults.name == _SHIPPED_FAULTS and not faults.exists()
+        shipped = faults.name == _SHIPPED_FAULTS and not faults.is_file()
         scenario = shipped_simulation(faults.name) if shipped else faults
         spec = replace(spec, faults=spec.faults + load_scenario(scenario, len(spec.axes), spec.sync_period_us))
     # SIGHUP is left alone, so that nohup works.

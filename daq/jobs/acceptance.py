@@ -59,7 +59,8 @@ class Accept:
         _require_written(context, session)
         last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
-        made, _ = plan_with_room(context, context.settings.seed + SEED_STEP, self.duration_s)
+        body = next(block.payload for block in guided(session).blocks if block.payload is not None)
+        made, _ = plan_with_room(context, body, context.settings.seed + SEED_STEP, self.duration_s)
         plan = write_plan(context, path, made)
         say_moves(context, RUN, path)
         planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)

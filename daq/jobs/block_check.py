@@ -98,19 +98,27 @@ def look_at_geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
 
 
 def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
-    """Return the earlier blocks that the last one is weighed beside: those with the same body, else the bare ones."""
+    """Return the earlier blocks that the last one is weighed beside.
+
+    They have the same body; without such blocks, a loaded block is weighed beside bare ones, and a bare block that is
+    recorded again beside loaded ones.
+    """
     *earlier, last = blocks
     same = tuple(block for block in earlier if block.payload == last.payload)
     return same or tuple(earlier)
 
 
-def mistake_in(cell: Cell, blocks: Sequence[Block], facts: BlockFacts) -> Mistake | None:
+def mistake_in(
+    cell: Cell, payload: str, blocks: Sequence[Block], facts: BlockFacts, repeated: Sequence[str] = ()
+) -> Mistake | None:
     """Judge the last block.
 
     Args:
         cell: of the session.
+        payload: name of the body of the loaded blocks; its mass is that of the cell file until it was weighed.
         blocks: of the session, in the order of their recording.
         facts: of the last block, beside `compared_with` of these blocks.
+        repeated: names of the blocks that were recorded again because of a mistake.
     """
     last = blocks[-1]
     if facts.unreadable:
@@ -119,18 +127,41 @@ def mistake_in(cell: Cell, blocks: Sequence[Block], facts: BlockFacts) -> Mistak
     limited = _limited(cell, facts)
     if limited:
         return Mistake((last.name,), limited, is_of_body=False)
-    bodies = {block.payload: block.mass_kg for block in blocks if block.payload is not None and block.mass_kg}
-    if facts.added_kg is None or not bodies:
-        return None
-    ((payload, mass_kg),) = bodies.items()
+    declared_kg = next(body.mass_kg for body in cell.payloads if body.name == payload)
+    weighed_kg = [block.mass_kg for block in blocks if block.payload is not None and block.mass_kg]
+    body = _Body(payload, weighed_kg[-1] if weighed_kg else declared_kg)
+    return _mistake_of_body(blocks, body, facts, is_again=last.name in repeated)
+
+
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """What the loaded blocks carry."""
+
+    name: str
+    mass_kg: float
+
+    @property
+    def shown(self) -> str:
+        """Its name in a message."""
+        return self.name.upper()
+
+
+def _mistake_of_body(blocks: Sequence[Block], body: _Body, facts: BlockFacts, *, is_again: bool) -> Mistake | None:
+    """Judge the body on the flange in the last block by its weight beyond `compared_with`."""
+    added_kg = facts.added_kg
     noise_kg = LEAST_SIGMAS * facts.added_std_kg
-    if noise_kg > COARSE_SHARE * mass_kg:
+    if added_kg is None or noise_kg > COARSE_SHARE * body.mass_kg:
         return None
-    least_kg = max(LEAST_SHARE * mass_kg, noise_kg)
+    last = blocks[-1]
+    least_kg = max(LEAST_SHARE * body.mass_kg, noise_kg)
     has_same = compared_with(blocks)[-1].payload == last.payload
+    if has_same and last.payload is None:
+        return _bare_beside_bare(blocks, body, added_kg, least_kg)
     if has_same:
-        return _beside_same(last, payload, facts.added_kg, least_kg) or _turned(last, mass_kg, facts)
-    return _beside_bare(blocks, payload, mass_kg, facts.added_kg, least_kg)
+        return _loaded_beside_loaded(last, body, added_kg, least_kg) or _turned(last, body.mass_kg, facts)
+    if last.payload is None:
+        return _bare_beside_loaded(last, body, added_kg, least_kg)
+    return _loaded_beside_bare(blocks, body, added_kg, least_kg, is_again=is_again)
 
 
 def _limited(cell: Cell, facts: BlockFacts) -> str:
@@ -146,16 +177,28 @@ def _limited(cell: Cell, facts: BlockFacts) -> str:
     return ""
 
 
-def _beside_same(last: Block, payload: str, added_kg: float, least_kg: float) -> Mistake | None:
-    """Judge a block beside earlier ones that should carry the same."""
+def _bare_beside_bare(blocks: Sequence[Block], body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+    """Judge a bare block beside earlier bare ones."""
     if abs(added_kg) <= least_kg:
         return None
-    name = payload.upper()
-    if last.payload is None:
-        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {name} off."
+    last = blocks[-1]
+    if added_kg > 0.0:
+        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {body.shown} off."
         return Mistake((last.name,), text)
+    earlier = tuple(block.name for block in compared_with(blocks))
+    text = (
+        f"The flange carried about {-added_kg:.2g} kg less than in {' and '.join(earlier)}, where it should be bare, "
+        "too. All of these are recorded again, without anything on the flange."
+    )
+    return Mistake((*earlier, last.name), text)
+
+
+def _loaded_beside_loaded(last: Block, body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+    """Judge a loaded block beside earlier loaded ones."""
+    if abs(added_kg) <= least_kg:
+        return None
     change = f"{abs(added_kg):.2g} kg {'more' if added_kg > 0.0 else 'less'}"
-    text = f"The flange carried about {change} than in the loaded blocks before: mount {name}, as it was then."
+    text = f"The flange carried about {change} than in the loaded blocks before: mount {body.shown}, as it was then."
     return Mistake((last.name,), text)
 
 
@@ -174,31 +217,46 @@ def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
     return Mistake((last.name,), text)
 
 
-def _beside_bare(
-    blocks: Sequence[Block], payload: str, mass_kg: float, added_kg: float, least_kg: float
+def _bare_beside_loaded(last: Block, body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+    """Judge a bare block beside loaded ones, as the first bare block that is recorded again."""
+    if abs(added_kg) > least_kg:
+        return None
+    text = f"The flange carried the same as in the loaded blocks before: take {body.shown} off."
+    return Mistake((last.name,), text)
+
+
+def _loaded_beside_bare(
+    blocks: Sequence[Block], body: _Body, added_kg: float, least_kg: float, *, is_again: bool
 ) -> Mistake | None:
-    """Judge the first loaded block beside the bare ones."""
+    """Judge the first loaded block beside the bare ones.
+
+    Where it carries the same, the body was forgotten, as a rule: one block tells. Only where it carries the same once
+    more, the body was there in the bare ones.
+    """
     last = blocks[-1]
-    name = payload.upper()
     everything = tuple(block.name for block in blocks)
+    bare = " and ".join(everything[:-1])
     again = "All of these are recorded again, those before the last one without anything on the flange."
+    if abs(added_kg) <= least_kg and not is_again:
+        text = f"The flange carried the same as in {bare}: {body.shown} was missing. Mount it."
+        return Mistake((last.name,), text)
     if abs(added_kg) <= least_kg:
         text = (
-            f"The flange carried the same in {' and '.join(everything)}: {name} was missing now, or there before. "
-            f"{again}"
+            f"The flange carried the same as in {bare} once more: if {body.shown} is mounted now, it was there before, "
+            f"too. {again}"
         )
         return Mistake(everything, text)
     if added_kg < 0.0:
         text = (
             f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more without load than with "
-            f"{name}: the two were exchanged. {again}"
+            f"{body.shown}: the two were exchanged. {again}"
         )
         return Mistake(everything, text)
     lower, upper = SAME_BODY
-    if not lower <= added_kg / mass_kg <= upper:
+    if not lower <= added_kg / body.mass_kg <= upper:
         text = (
-            f"The flange carried about {added_kg:.2g} kg by the nameplate gains, and {name} has "
-            f"{mass_kg:g} kg: another body was mounted, or the nameplate is far off."
+            f"The flange carried about {added_kg:.2g} kg by the nameplate gains, and {body.shown} has "
+            f"{body.mass_kg:g} kg: another body was mounted, or the nameplate is far off."
         )
         return Mistake((last.name,), text)
     return None

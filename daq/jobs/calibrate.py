@@ -16,10 +16,16 @@ from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
 from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
 from daq.jobs.gain_target import target_of
-from daq.jobs.guided import GuidedSettings, Rehearse, UntilPrecise, fit_corrected_command, plan_with_room
+from daq.jobs.guided import (
+    GuidedSettings,
+    Rehearse,
+    UntilPrecise,
+    fit_corrected_command,
+    next_step_after,
+    plan_with_room,
+)
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
-from daq.jobs.position import goes_on_with
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
 from daq.jobs.session import Basis, Session
 from daq.jobs.stages import TO_DECISION, Certify, Stage, run_stages
@@ -27,7 +33,6 @@ from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
-from ident.errors import ChannelsExchanged, GeometryTurned
 
 RESUME_WITHIN_H = 12.0  #: An older session has another temperature, and perhaps another payload
 
@@ -68,28 +73,15 @@ def calibrate(
 def _name_next_step(cell_file: Path, folder: Path, error: BaseException) -> None:
     """Add to an error which blocks the session has, and what the same command does next."""
     found = next((one for one in sessions.sessions(folder.parent) if one.folder == folder), None)
-    if found is None or found.finished or not isinstance(found.state, GuidedState):
+    if found is None or not isinstance(found.state, GuidedState):
         return
     blocks = ", ".join(run.name for run in found.state.runs)
     is_taken = any(note.startswith("kept: ") for note in all_notes(error))  # by what could not be recorded
     if not is_taken:
         error.add_note(f"kept: {blocks or 'no block yet'}")
-    if isinstance(error, ChannelsExchanged):
-        error.add_note("hint: the same command then begins a new session")
-        return
-    if isinstance(error, GeometryTurned):
-        error.add_note(f"hint: {_after_correction(cell_file, found)}")
-        return
-    error.add_note(f"hint: remove the cause, then start the same command: {goes_on_with(found.state)}")
-
-
-def _after_correction(cell_file: Path, session: Session) -> str:
-    """Say what to do with the blocks of a session once its cell file is corrected."""
-    again = "the same command begins a new session"
-    command = fit_corrected_command(cell_file, session)
-    if not command:
-        return f"correct the cell file; {again}"
-    return f"correct the cell file; `{command}` then fits these blocks with it, and {again}"
+    next_step = next_step_after(error, cell_file, found)
+    if next_step:
+        error.add_note(f"hint: {next_step}")
 
 
 def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
@@ -161,7 +153,7 @@ def check_readiness(context: SessionContext, payload: str | None, block_s: float
         _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
         _checked("payload", lambda: _payload_text(context.cell, payload)),
         _checked("disk, interlock, drives", lambda: _ready_text(context)),
-        _checked("expected precision", lambda: _predicted_text(context, block_s)),
+        _checked("expected precision", lambda: _predicted_text(context, payload, block_s)),
     )
 
 
@@ -209,8 +201,10 @@ def _ready_text(context: SessionContext) -> str:
     return "free space, history readable, robot released, drives as declared and without power"
 
 
-def _predicted_text(context: SessionContext, block_s: float) -> str:
-    plan, _ = plan_with_room(context, context.settings.seed, block_s)
+def _predicted_text(context: SessionContext, payload: str | None, block_s: float) -> str:
+    declared = [one.name for one in context.cell.payloads]
+    body = payload if payload in declared else None  # the line of the payload says so
+    plan, _ = plan_with_room(context, body, context.settings.seed, block_s)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
     return f"predicted σ after one bare and one loaded block: {listed}"

@@ -27,7 +27,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.policy import DEFAULT_TARGET_SIGMA_PERCENT
 from daq.config.recalibration import PlannedRun
-from daq.documents.session_state import Block, GainSoFar, GuidedState, Progress
+from daq.documents.session_state import Block, GainSoFar, GuidedState, Outcome, Progress
 from daq.errors import ConfigurationError, ConfigurationInconsistent, JobHeld, PlanTooShort, writing
 from daq.jobs.block_check import compared_with, mistake_in
 from daq.jobs.block_order import (
@@ -42,6 +42,7 @@ from daq.jobs.block_order import (
 )
 from daq.jobs.context import NextRun, SessionContext, before_motion
 from daq.jobs.journal import Level
+from daq.jobs.position import goes_on_with
 from daq.jobs.recording import log_of, move_without_log
 from daq.jobs.session import Session
 from daq.workflow.accepted_room import AcceptedRoom, accepted_room
@@ -97,8 +98,13 @@ class UntilPrecise:
     settings: GuidedSettings
 
     def prepare(self, context: SessionContext, session: Session) -> Session:
-        """Forget blocks that were decided, but not recorded, and judge the others if that was not done."""
+        """Forget blocks that were decided, but not recorded, and judge the others if that was not done.
+
+        Raises:
+            ConfigurationInconsistent: its blocks carry another payload than is asked for.
+        """
         state = guided(session)
+        _require_same_payload(state, self.settings.payload)
         recorded = {run.name for run in state.runs}
         kept = tuple(block for block in state.blocks if block.name in recorded)
         has_lost = state.judged_blocks > len(kept)  # a log was damaged since
@@ -139,7 +145,7 @@ class UntilPrecise:
             session = session.update(mass_kg=mass_kg)
         path = session.folder / plan_name(number)
         if number < len(FIRST_BLOCKS):
-            session, plan = self.plan_block(context, session, name, number, path)
+            session, plan = self._rehearsed_plan(context, session, name, number, path)
             session = session.update(bare_first=self._bare_first(context, guided(session), plan, number))
         else:
             session, plan = self._later_plan(context, session, number, path)
@@ -203,10 +209,15 @@ class UntilPrecise:
         The session is complete when all gains are precise, or its time is up.
 
         Raises:
-            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are kept.
-            JobHeld: a block has shown the same mistake too often.
+            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are kept, and the
+                session is over.
+            JobHeld: a block was recorded again too often because of a mistake.
         """
-        return self._judged(context, self._checked(context, session))
+        try:
+            return self._judged(context, self._checked(context, session))
+        except (ChannelsExchanged, GeometryTurned):
+            session.update(outcome=Outcome.UNFIT)  # the same blocks would be refused again
+            raise
 
     def _checked(self, context: SessionContext, session: Session) -> Session:
         """Look for mistakes in the block that was recorded last, and forget it if it is to be recorded again."""
@@ -219,7 +230,7 @@ class UntilPrecise:
         last = in_order[-1]
         earlier = [log_of(session, block.name) for block in compared_with(in_order)]
         facts = context.tools.look(context.cell, log_of(session, last.name), earlier)
-        mistake = mistake_in(context.cell, in_order, facts)
+        mistake = mistake_in(context.cell, self.settings.payload, in_order, facts, state.repeated)
         if mistake is None:
             if facts.added_kg is not None and last.payload is not None and compared_with(in_order)[-1].payload is None:
                 context.journal.say(Level.INFO, "weighed", added_kg=facts.added_kg, std_kg=facts.added_std_kg)
@@ -229,14 +240,14 @@ class UntilPrecise:
             turned = context.tools.geometry(context.cell, logs)
             _refuse_geometry(() if turned is None else (turned,))
         context.journal.say(Level.WARNING, "mistake in a block", block=last.name, text=mistake.text)
-        if not context.operator.record_again(_planned(session, last), mistake.text):
+        if not context.operator.record_again(_planned(session, last), mistake.blocks, mistake.text):
             context.journal.say(Level.NOTICE, "kept as it is", block=last.name)
             return session.update(checked_blocks=recorded)
         repeated = (*state.repeated, *mistake.blocks)
         if repeated.count(last.name) > MAX_REPETITIONS:
             raise JobHeld(
                 last.name,
-                found=f"the same mistake in {MAX_REPETITIONS + 1} recordings: {mistake.text}",
+                found=f"a mistake in {MAX_REPETITIONS + 1} recordings; the last one: {mistake.text}",
                 expected="a block without it",
                 remedy="see to the flange and to the cell file; the same command goes on with this block",
             )
@@ -303,6 +314,7 @@ class UntilPrecise:
             session,
             number,
             speed=room.speed,
+            acceleration=room.acceleration,
             # More moves never make what is known worse.
             largest_condition=np.inf,
             largest_std_percent=np.inf,
@@ -333,7 +345,15 @@ class UntilPrecise:
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
         inside = replace(experiment, scene=room.scene(experiment.scene))
-        session, made = self._with_room(context, session, number, speed=room.speed, experiment=inside, box=room.box)
+        session, made = self._with_room(
+            context,
+            session,
+            number,
+            speed=room.speed,
+            acceleration=room.acceleration,
+            experiment=inside,
+            box=room.box,
+        )
         return session, write_plan(context, path, made)
 
     def _with_room(
@@ -344,7 +364,8 @@ class UntilPrecise:
         ``further`` are arguments of the planner.
         """
         block_s = self.block_s(guided(session))
-        plan, taken_s = plan_with_room(context, self.settings.seed + number, block_s, **further)
+        seed = self.settings.seed + number
+        plan, taken_s = plan_with_room(context, self.settings.payload, seed, block_s, **further)
         if taken_s > block_s:
             session = session.update(block_s=taken_s)
         return session, plan
@@ -367,6 +388,20 @@ class UntilPrecise:
                 remedy="nothing moves; put one of them back, or begin a new session in another folder (--sessions)",
             )
         return accepted_room(context.cell, experiment.scene, plans)
+
+    def _rehearsed_plan(
+        self, context: SessionContext, session: Session, name: str, number: int, path: Path
+    ) -> tuple[Session, Plan]:
+        """Load the moves of one of the first blocks if they were rehearsed; else make them.
+
+        A later rehearsal may have found that blocks have to be longer: what the operator has seen stays as it is.
+        """
+        if number < guided(session).rehearsed:
+            with suppress(ConfigurationError):  # what is missing or damaged is made again
+                plan = load_plan(path, context.cell)
+                say_moves(context, name, path)
+                return session, plan
+        return self.plan_block(context, session, name, number, path)
 
     def plan_block(
         self, context: SessionContext, session: Session, name: str, number: int, path: Path
@@ -457,6 +492,24 @@ def _next_number(state: GuidedState) -> int:
     return next(number for number in count() if number not in taken)
 
 
+def _require_same_payload(state: GuidedState, payload: str) -> None:
+    """Refuse to go on with another body on the flange than in the blocks so far.
+
+    Raises:
+        ConfigurationInconsistent: names both.
+    """
+    mounted = {block.payload for block in state.blocks if block.payload is not None}
+    others = sorted(mounted - {payload})
+    if others:
+        raise ConfigurationInconsistent(
+            f"payload {payload!r}",
+            found=f"a session whose blocks carry {others[0]!r}",
+            expected="the same payload in all loaded blocks of a session",
+            remedy=f"nothing moves; pass --payload {others[0]} to go on, or begin a new session in another folder "
+            "(--sessions)",
+        )
+
+
 def _refuse_geometry(diagnoses: Sequence[Diagnosis]) -> None:
     """Refuse blocks in a geometry that is far from the described one.
 
@@ -468,19 +521,23 @@ def _refuse_geometry(diagnoses: Sequence[Diagnosis]) -> None:
         raise refused
 
 
-def plan_with_room(context: SessionContext, seed: int, duration_s: float, **further: Any) -> tuple[Plan, float]:
+def plan_with_room(
+    context: SessionContext, payload: str | None, seed: int, duration_s: float, **further: Any
+) -> tuple[Plan, float]:
     """Make a plan, of twice the duration where it has no room for enough moves, and so on; return both.
 
     Args:
         context: of the session.
+        payload: name of the body that the moves are made with, beside those without load; None for the first one.
         seed: of the moves.
         duration_s: asked for.
-        **further: arguments of the planner.
+        **further: arguments of the planner; without an ``experiment``, the plan is for one bare and one loaded run.
 
     Raises:
         PlanTooShort: even the longest one has no room.
         UsageError, ConfigurationInconsistent: there are no such moves.
     """
+    further.setdefault("experiment", experiment_of(context.cell, payload))
     longest_s = duration_s * 2.0**MOST_DOUBLINGS
     taken_s = duration_s
     while True:
@@ -520,6 +577,28 @@ def write_plan(context: SessionContext, path: Path, made: Plan) -> Plan:
 def say_moves(context: SessionContext, run: str, path: Path) -> None:
     """Say where the page is that shows the moves of a run."""
     context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html")))
+
+
+def next_step_after(error: BaseException, cell_file: Path, session: Session) -> str:
+    """Say what to do after an error in a guided session, and what the same command then does.
+
+    Empty where the session is over, and the error itself says what to do.
+    """
+    if isinstance(error, ChannelsExchanged):
+        return "correct the wiring or the cell file; the same command then begins a new session"
+    if isinstance(error, GeometryTurned):
+        command = fit_corrected_command(cell_file, session)
+        refit = f"`{command}` then fits these blocks with it, and " if command else ""
+        return f"correct the cell file; {refit}the same command begins a new session"
+    state = guided(session)
+    if state.outcome in (Outcome.UNFIT, Outcome.REFUSED):
+        return ""
+    return go_on(state)
+
+
+def go_on(state: GuidedState) -> str:
+    """Say how to go on with a session that an error has interrupted."""
+    return f"remove the cause, then start the same command: {goes_on_with(state)}"
 
 
 def fit_corrected_command(cell_file: Path, session: Session) -> str:
@@ -658,6 +737,8 @@ def _missing(gains: tuple[GainSoFar, ...], minutes: float) -> str:
     if not gains:
         return f"the gains cannot be identified from {minutes:g} min of motion"
     coarse = [gain for gain in gains if not gain.is_precise]
+    if not coarse:
+        return f"a held-out block in {minutes:g} min of motion; every gain is at its target"
     listed = ", ".join(f"{gain.axis} {gain.std_percent:.2f} %" for gain in coarse)
     return f"σ after {minutes:g} min of motion: {listed}; the target is {coarse[0].target_percent:g} %"
 
@@ -671,8 +752,10 @@ def _would_help(estimate: BlockEstimate, needed_s: float) -> tuple[str, ...]:
     """
     if not estimate.gains:
         return ("see above why the gains are not known; correct that, and record again",)
-    needed_min = math.ceil(needed_s / 60.0)
-    found = [f"more time: about {needed_min} min of motion in all at this rate (--time-limit {needed_min})"]
+    found: list[str] = []
+    if math.isfinite(needed_s):
+        needed_min = math.ceil(needed_s / 60.0)
+        found.append(f"more time: about {needed_min} min of motion in all at this rate (--time-limit {needed_min})")
     if estimate.outlook is None:
         return tuple(found)
     for gain, cause in zip(estimate.gains, estimate.outlook.causes, strict=True):

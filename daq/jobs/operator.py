@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -48,11 +48,12 @@ class Operator(Protocol):
             MotionRefused: motion is not permitted.
         """
 
-    def record_again(self, run: PlannedRun, mistake: str) -> bool:
-        """Decide whether a block is recorded again because of a mistake that it shows; else it stays as it is.
+    def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
+        """Decide whether blocks are recorded again because of a mistake that the last one shows; else they stay.
 
         Args:
-            run: the block.
+            run: the last block.
+            blocks: names of those to record again.
             mistake: what was found and what to do.
         """
 
@@ -111,7 +112,7 @@ class CellPolicy:
         """Name policy and interlock; `section_of` has refused a cell without this permission."""
         return f"the policy of cell {self.cell.name} and its interlock, for {self.who}"
 
-    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+    def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
         """Yes: the mount command is asked once more."""
         return True
 
@@ -145,7 +146,7 @@ class GivenAnswers:
         """Return who permitted it beforehand."""
         return self.granted_by
 
-    def record_again(self, run: PlannedRun, mistake: str) -> bool:
+    def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
         """Yes: what it carries is mounted once more."""
         return True
 

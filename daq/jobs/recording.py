@@ -33,6 +33,7 @@ from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import headline, summary
 from daq.report.residual_page import PAGE
+from daq.workflow.experiment import experiment_of
 from daq.workflow.fit import check_holdout
 from daq.workflow.interlock import release_check
 from daq.workflow.plan import Plan, load_plan, save_plan
@@ -159,7 +160,9 @@ class FixedRuns:
                 return load_plan(path, context.cell)
         context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
         with writing(path):
-            save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
+            body = next((run.payload for run in self.listed if run.payload is not None), None)
+            experiment = experiment_of(context.cell, body)
+            save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s, experiment=experiment), path)
         return load_plan(path, context.cell)  # as a person can read it
 
 

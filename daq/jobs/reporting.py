@@ -6,7 +6,7 @@ import hashlib
 import re
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
@@ -18,8 +18,8 @@ from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, Out
 from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import SessionContext
+from daq.jobs.guided import fit_corrected_command, go_on, next_step_after
 from daq.jobs.journal import Level
-from daq.jobs.position import goes_on_with
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Session
 from daq.ledger.audit import AuditAction, AuditEntry
@@ -27,8 +27,10 @@ from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.document import json_text
 from daq.report.job_schemas import JobReport, RefusedJob, SessionReport
 from daq.report.residual_page import PAGE
+from daq.workflow.diagnoses import HIDING_EXCHANGES
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
+from ident.errors import Diagnosis
 
 AnyReport = TypeVar("AnyReport", JobReport, SessionReport)
 
@@ -45,6 +47,7 @@ class Conclusion:
     exit_code: int  #: of the command
     session: Session | None  #: with its final state; None where none was begun
     remark: str  #: reason, in one sentence
+    next_step: str = ""  #: of the operator, after an error that has ended a guided session; empty otherwise
 
 
 def report_success(context: SessionContext, session: Session) -> Conclusion:
@@ -60,7 +63,7 @@ def report_success(context: SessionContext, session: Session) -> Conclusion:
         code = ExitCode.PROPOSED
     elif _is_contradicted(session.state):
         code = ExitCode.NOT_ACCEPTED
-    return _report(context, session, outcome, code, remark, "")
+    return _report(context, Conclusion(outcome, int(code), session, remark), session, "")
 
 
 def report_failure(context: SessionContext, folder: Path, error: BaseException) -> None:
@@ -71,7 +74,10 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
         outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
         code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
         problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        _report(context, session, outcome, code, "; ".join((problem, *stop_notes(error))), problem)
+        remark = "; ".join((problem, *stop_notes(error)))
+        is_guided = isinstance(session.state, GuidedState)
+        next_step = next_step_after(error, context.file, session) if is_guided else ""
+        _report(context, Conclusion(outcome, int(code), session, remark, next_step), session, problem)
     except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
@@ -94,18 +100,23 @@ def audit_entry(
     )
 
 
-def _report(
-    context: SessionContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
-) -> Conclusion:
+def _report(context: SessionContext, ended: Conclusion, session: Session, problem: str) -> Conclusion:
+    """Write down how a session ended: in audit, state, summary and metrics.
+
+    Raises:
+        OutputFailed, AuditUnusable: something could not be written; everything else was.
+    """
+    outcome = ended.outcome
+    code = ended.exit_code
     now = context.tools.now()
     state = session.state.with_(
-        outcome=outcome, exit_code=int(code), problem=problem, ended=now.isoformat(timespec="seconds")
+        outcome=outcome, exit_code=code, problem=problem, ended=now.isoformat(timespec="seconds")
     )
     unwritten: DaqError | None = None
     try:
         details: dict[str, object] = {
             "outcome": outcome.value,
-            "exit_code": int(code),
+            "exit_code": code,
             "problem": problem,
             "logs": {run.name: run.sha256 for run in state.runs},
             "calibration_sha256": None if state.fitted is None else state.fitted.calibration_sha256,
@@ -117,9 +128,9 @@ def _report(
         context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
         unwritten = error
     session = Session(session.folder, state)
-    conclusion = Conclusion(outcome, int(code), session, remark)
+    conclusion = replace(ended, session=session)
     level = Level.NOTICE if outcome.good else Level.ERROR
-    context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
+    context.journal.say(level, "session ended", outcome=outcome.value, exit_code=code, remark=ended.remark)
     try:
         _write_summary(conclusion, session, context.file)
     finally:
@@ -281,22 +292,32 @@ def undo_command(cell_file: Path, *, in_drives: bool) -> str:
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
-    """List the next steps for the operator, a line each: those of the outcome, then what the fit says to check."""
+    """List the next steps for the operator, a line each: those of the outcome, and what the fit says to check.
+
+    What is wrong with the description comes first as long as nothing is written: with a corrected cell file, the
+    calibration of the old one can no longer be.
+    """
     steps = _steps(conclusion, cell_file)
-    checks = _checks(conclusion)
+    diagnoses = _diagnoses(conclusion)
+    checks = [f"CHECK {one.subject}: {one.remedy}" for one in diagnoses]
+    is_described_wrongly = any(one.name in HIDING_EXCHANGES for one in diagnoses)
+    session = conclusion.session
+    if is_described_wrongly and session is not None and isinstance(session.state, GuidedState):
+        command = fit_corrected_command(cell_file, session)
+        checks.append(f"with the corrected file, this fits the recorded blocks again: {command}")
     if checks and steps == NOTHING_TO_DO:
         return checks
+    if is_described_wrongly and conclusion.outcome is Outcome.PROPOSED:
+        return [*checks, "or, with the description as it is:", *steps]
     return [*steps, *checks]
 
 
-def _checks(conclusion: Conclusion) -> list[str]:
-    """What a good calibration says to check, a line each; a failed check of another outcome says itself what to do."""
+def _diagnoses(conclusion: Conclusion) -> tuple[Diagnosis, ...]:
+    """What a good calibration says to check; a failed check of another outcome says itself what to do."""
     if conclusion.session is None or not conclusion.outcome.good:
-        return []
+        return ()
     calibration = calibration_of_session(conclusion.session)
-    if calibration is None:
-        return []
-    return [f"CHECK {one.subject}: {one.remedy}" for one in calibration.diagnoses]
+    return () if calibration is None else calibration.diagnoses
 
 
 def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
@@ -326,9 +347,11 @@ def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
     if outcome is Outcome.APPLIED and target is not None:
         loading = [] if target.in_drives else ["let the controller load the file"]
         return [*loading, f"to undo it: {undo}"]
+    if conclusion.next_step:
+        return [conclusion.next_step]
     is_to_go_on = outcome in (Outcome.STOPPED, Outcome.INTERRUPTED)
     if is_to_go_on and session is not None and isinstance(session.state, GuidedState):
-        return [f"remove the cause, then start the same command: {goes_on_with(session.state)}"]
+        return [go_on(session.state)]
     return {
         Outcome.REFUSED: ["find out why the check failed; the same command then begins a new session"],
         Outcome.UNFIT: [

@@ -34,7 +34,8 @@ class AcceptedRoom:
     """Room and speed of accepted moves."""
 
     box: TargetBox  #: joint positions between which they stay
-    speed: float  #: share of the joints' limits of velocity and acceleration that none of them exceeds
+    speed: float  #: share of the joints' limits of velocity that none of them exceeds
+    acceleration: float  #: share of the joints' limits of acceleration that none of them exceeds
     #: Where their moving parts come; None where the cell file declares a workspace, or the shape of the arm is unknown.
     reach: Extent | None
 
@@ -64,14 +65,16 @@ def accepted_room(cell: Cell, scene: CheckedScene, plans: Sequence[Plan]) -> Acc
     moves = [move for plan in plans for move in plan.moves]
     targets = np.array([move.target_rad for move in moves])
     box = TargetBox(targets.min(axis=0), targets.max(axis=0))
-    speed = min(max(move.velocity for move in moves), max(move.acceleration for move in moves))
+    speed = max(move.velocity for move in moves)
+    acceleration = max(move.acceleration for move in moves)
     checker = scene.checker
     is_declared = checker.scene.workspace is not None
     if is_declared or not any(capsule.link != BASE for capsule in checker.scene.capsules):
-        return AcceptedRoom(box, speed, None)
+        return AcceptedRoom(box, speed, acceleration, None)
     paths = [path for plan in plans for path in paths_of(cell, plan.moves)]
     postures = [path.at(np.linspace(0.0, path.duration_s, STEPS))[0] for path in paths]
-    return AcceptedRoom(box, speed, extent(checker, placed(checker, np.concatenate(postures))))
+    reach = extent(checker, placed(checker, np.concatenate(postures)))
+    return AcceptedRoom(box, speed, acceleration, reach)
 
 
 def placed(checker: Checker, position: FloatArray) -> FloatArray:

@@ -526,6 +526,7 @@ DIAGNOSED_AS: dict[type[Effect], str] = {
 """Diagnosis of a wrong description, or of currents that are late, by the effect that corrects it."""
 HIDING_EXCHANGES = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
 """Those of a wrong description, which may look like exchanged currents."""
+FIT_AGAIN = "then fit the same logs again, with the corrected file as `--cell`"
 SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
 INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"
 
@@ -549,7 +550,8 @@ def _correction_diagnosis(
             described = scale * cell.axes[placed.axis].zero_offset_rad
             found = _zero_text(placed.axis, name, values, deviations, model)
             expected = "positions whose zero is that of the URDF"
-            remedy = zero_remedy(name, scale * values[0], scale * deviations[0], unit, described) + "; then fit again"
+            remedy = zero_remedy(name, scale * values[0], scale * deviations[0], unit, described)
+            remedy += f"; {FIT_AGAIN}"
         case LatePosition():
             found = f"the position of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
@@ -579,9 +581,7 @@ def _correction_diagnosis(
             turned = vector_text(suggested_gravity(found_m_s2, std_m_s2))
             found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
             expected = f"{vector_text(declared)}, as the cell file says"
-            remedy = (
-                f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; then fit again"
-            )
+            remedy = f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; {FIT_AGAIN}"
     return _diagnosis_of(placed, name, (), found, expected, remedy)
 
 

@@ -279,12 +279,12 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     edge = max(filter_.half - inside, 0) / RATE_HZ
     declared = declared_efforts(model, cell.urdf)
     effort = believable_efforts(expectation, declared, fast_motion.position_rad, RUNS)
-    remarks = (*remarks, *_effort_remarks(cell, declared, effort))
+    remarks = (*remarks, *_effort_remarks(cell, declared, effort, from_urdf=from_urdf))
     return Experiment(cell, design, scene, mounted, period, edge, effort, remarks)
 
 
-def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray) -> tuple[str, ...]:
-    """Say which axes have no effort limit that moves could be kept below."""
+def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray, *, from_urdf: bool) -> tuple[str, ...]:
+    """Say which axes have no effort limit that moves could be kept below; masses of the links may be guessed."""
     lines: list[str] = []
     unknown: list[str] = []
     refuted: list[str] = []
@@ -296,9 +296,10 @@ def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray) -> t
     if unknown:
         lines.append(f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there")
     if refuted:
+        masses = "the masses of the URDF" if from_urdf else "guessed masses of the links"
         lines.append(
-            f"torque limits: gravity alone asks more than the `effort` of {', '.join(refuted)} in the URDF; not kept "
-            "there. Correct `effort`"
+            f"torque limits: with {masses}, gravity alone asks more than the `effort` of {', '.join(refuted)} in the "
+            "URDF; not kept there. Correct `effort` or the masses; the planner knows no balancer"
         )
     return tuple(lines)
 

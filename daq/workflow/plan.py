@@ -146,6 +146,7 @@ class Search:
         rng: np.random.Generator,
         duration_s: float,
         speed: float,
+        acceleration: float,
         largest_condition: float,
         goal: PlanGoal,
         box: TargetBox,
@@ -156,11 +157,14 @@ class Search:
         self._rng = rng
         self._duration_s = duration_s
         self._speed = speed
+        self._acceleration = acceleration
         self._largest_condition = largest_condition
         self._goal = goal
         self._low = box.lower
         self._high = box.upper
         self._allowed = allowed
+        self._obstructed = 0  #: ways that were refused because something is in the way
+        self._too_heavy = 0  #: ways that were refused because the drives cannot carry them
 
     def random_moves(self) -> Draft:
         """Clear random moves that fill the duration.
@@ -330,10 +334,13 @@ class Search:
                 move = replace(move, target_rad=self._written(target))
             if np.array_equal(target, start) or not self._is_within(move):
                 continue
-            if checker.obstruction(start, np.array(move.target_rad)) is None:
-                carried = self._slow_enough(start, move)
-                if carried is not None:
-                    return carried
+            if checker.obstruction(start, np.array(move.target_rad)) is not None:
+                self._obstructed += 1
+                continue
+            carried = self._slow_enough(start, move)
+            if carried is not None:
+                return carried
+            self._too_heavy += 1
         return None
 
     def _slow_enough(self, start: FloatArray, move: PlannedMove) -> PlannedMove | None:
@@ -355,7 +362,7 @@ class Search:
         return PlannedMove(
             target_rad=self._written(self._rng.uniform(self._low, self._high)),
             velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
-            acceleration=round(self._speed * float(self._rng.uniform(0.4, 1.0)), PLACES),
+            acceleration=round(self._acceleration * float(self._rng.uniform(0.4, 1.0)), PLACES),
             dwell_s=DWELL_S,
         )
 
@@ -381,13 +388,12 @@ class Search:
             obstruction = checker.obstruction(target, target)
             if obstruction is not None:
                 blocking.append(obstruction)
+        if self._too_heavy > self._obstructed:
+            found += f": also slowly, they ask too much torque of {' and '.join(self._too_weak())}"
+            expected = f"at most the `effort` of the URDF over {EFFORT_MARGIN:g}"
+            remedy = "correct `effort` in the URDF, declare a lighter payload, or narrow the joint limits"
+            return _unfit(self._cell, self._duration_s, found, expected, remedy)
         if not blocking:
-            too_weak = self._too_weak()
-            if too_weak:
-                found += f": also slowly, they ask too much torque of {', '.join(too_weak)}"
-                expected = f"at most the `effort` of the URDF over {EFFORT_MARGIN:g}"
-                remedy = "correct `effort` in the URDF, declare a lighter payload, or narrow the joint limits"
-                return _unfit(self._cell, self._duration_s, found, expected, remedy)
             return _unfit(self._cell, self._duration_s, found, "room to move in", "widen the joint limits")
         pairs = Counter((one.first, one.second) for one in blocking)
         (worst, times), *_ = pairs.most_common(1)
@@ -400,7 +406,7 @@ class Search:
         return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
 
     def _too_weak(self) -> list[str]:
-        """Names of the axes whose drives cannot carry most of some slow random ways."""
+        """Names of the axes whose drives cannot carry most of some slow random ways, or at least the most of them."""
         paths: list[Trapezoid] = []
         start = np.array(self._random_move().target_rad)
         for _ in range(MAX_TRIES):
@@ -408,8 +414,9 @@ class Search:
             paths.append(path_of(self._cell, start, move))
             start = np.array(move.target_rad)
         is_heavy = EFFORT_MARGIN * self._experiment.effort_shares(paths) > 1.0
-        is_often_heavy = np.mean(is_heavy, axis=0) > 0.5
-        return list(compress(self._cell.axis_names, is_often_heavy))
+        share_heavy = np.mean(is_heavy, axis=0)
+        often = share_heavy > min(0.5, 0.99 * float(np.max(share_heavy)))
+        return list(compress(self._cell.axis_names, often))
 
 
 def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
@@ -466,6 +473,7 @@ def plan(
     duration_s: float = 40.0,
     exchanges: int = EXCHANGES,
     speed: float = 1.0,
+    acceleration: float | None = None,
     largest_condition: float | None = None,
     largest_std_percent: float = LARGEST_STD_PERCENT,
     experiment: Experiment | None = None,
@@ -478,14 +486,15 @@ def plan(
     Random moves fill the duration; then they are exchanged, shifted, stretched and sped up one at a time, and what
     lowers the predicted standard deviation of the worst gain stays. All moves keep position, velocity and acceleration
     limits, the workspace and clear of the arm itself, on their whole way, and the torque limits of the URDF with a
-    margin.
+    margin. The way to the first target is not known before the recording: see `way_to_first_target`.
 
     Args:
         cell: with robot, limits and a weighed payload.
         seed: the same seed gives the same plan.
         duration_s: of the run [s].
         exchanges: tries; every one of them is made. With 0 the random moves are the plan.
-        speed: share of the limits that the fastest moves may use.
+        speed: share of the limits of velocity that the fastest moves may use.
+        acceleration: share of the limits of acceleration that the hardest moves may use; ``speed`` when None.
         largest_condition: a plan worse than this is refused; that of the kind of robot when None.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
         experiment: that the plan is for, None for the one with the cell's first payload. After a fit, its design may
@@ -506,7 +515,17 @@ def plan(
     goal = goal or PlanGoal.of_first(experiment.design)
     room = _room(cell, duration_s, box)
     allowed = _allowed_targets(cell, box)
-    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition, goal, room, allowed)
+    search = Search(
+        experiment,
+        np.random.default_rng(seed),
+        duration_s,
+        speed,
+        speed if acceleration is None else acceleration,
+        largest_condition,
+        goal,
+        room,
+        allowed,
+    )
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
     information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
     predicted = experiment.design.std_percent(information)
@@ -618,18 +637,23 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
 
 
 def _slower(move: PlannedMove, share: float) -> PlannedMove:
-    """The same way at a share of its speed, as the plan file will say it."""
+    """The same way at a share of its speed, as the plan file will say it, and no slower than one may say."""
     velocity = round(move.velocity * share, PLACES)
     acceleration = round(move.acceleration * share**2, PLACES)
-    return replace(move, velocity=velocity, acceleration=acceleration)
+    return replace(
+        move,
+        velocity=max(velocity, LEAST_VELOCITY),
+        acceleration=max(acceleration, LEAST_ACCELERATION),
+    )
 
 
 # The file of a plan: moves that a person can read, change and approve before anything moves
 
 LONGEST_S = 3600.0
-Velocity = Annotated[float, Field(ge=0.01, le=1)]  #: Slower than a hundredth of its limits a move would hardly end
-Acceleration = Annotated[float, Field(ge=0.0001, le=1)]
-"""A hundredth of the speed on the same ways is a ten-thousandth of the acceleration."""
+LEAST_VELOCITY = 0.01  #: Share of the limits; slower than that a move would hardly end
+LEAST_ACCELERATION = 0.0001  #: A hundredth of the speed on the same ways is a ten-thousandth of the acceleration
+Velocity = Annotated[float, Field(ge=LEAST_VELOCITY, le=1)]
+Acceleration = Annotated[float, Field(ge=LEAST_ACCELERATION, le=1)]
 
 
 class _Move(StrictModel):
@@ -711,7 +735,9 @@ def save_plan(plan: Plan, path: Path) -> None:
 
 
 def load_plan(path: Path, cell: Cell) -> Plan:
-    """Read a plan for a cell; one that was changed by hand is checked as strictly as one that was made.
+    """Read a plan for a cell; one that was changed by hand keeps limits, duration and room, too.
+
+    What its moves show, and the torque that they ask for, are not judged again.
 
     Raises:
         ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,

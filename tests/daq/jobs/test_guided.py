@@ -46,7 +46,7 @@ from daq.jobs.block_order import FIRST_BLOCKS
 from daq.jobs.certificate import save_certificate
 from daq.jobs.context import Tools
 from daq.jobs.operator import GivenAnswers
-from daq.jobs.reporting import Conclusion, ending, to_do
+from daq.jobs.reporting import SUMMARY_TEXT, Conclusion, ending, to_do
 from daq.jobs.session import Session
 from daq.jobs.stages import TO_DECISION, Certify, Decide, Identify, Record, Stage, WatchDrift
 from daq.ledger.audit import AuditAction
@@ -544,7 +544,7 @@ def aimed_rig(folder: Path, made: MadeSession, planned: list[dict[str, Any]]) ->
     tools = rig.tools
 
     def plan_later(cell: Cell, *, seed: int, duration_s: float, **further: Any) -> Plan:
-        if not further:
+        if "box" not in further:
             return made.plans[seed]
         planned.append(further)
         return plan(cell, seed=seed, duration_s=duration_s, exchanges=24, **further)
@@ -673,6 +673,9 @@ def test_a_damaged_plan_for_the_worst_gain_is_made_again_in_the_same_room(
 # Mistakes in a block
 
 
+PAYLOAD = "disc"
+
+
 class Scale:
     """Says what is on the flange, as `look_at_block` finds it by the moves; what is mounted is in a file.
 
@@ -701,8 +704,7 @@ class Scale:
     ("bodies", "looked", "said"),
     [
         ((0.0, 4.6, 4.6), "123", ""),
-        ((0.0, 0.1, 0.0, 4.6, 4.6), "12123", "DISC was missing now, or there before"),
-        ((4.6, 4.6, 0.0, 4.6, 4.6), "12123", "DISC was missing now, or there before"),
+        ((0.0, 0.1, 4.6, 4.6), "1223", "DISC was missing. Mount it"),
         ((4.6, 0.0, 0.0, 4.6, 4.6), "12123", "the two were exchanged"),
         ((0.0, 1.7, 4.6, 4.6), "1223", "another body was mounted"),
         ((0.0, 4.6, 0.0, 4.6), "1233", "4.6 kg less than in the loaded blocks before"),
@@ -724,6 +726,33 @@ def test_a_block_with_the_wrong_body_is_recorded_again_and_kept(
     assert len(state_of(rig).runs) == len(FIRST_BLOCKS)
 
 
+def test_a_body_that_was_there_from_the_beginning_costs_every_block(tmp_path: Path, made_session: MadeSession) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    scale = Scale(rig, 4.6, 4.6, 4.6, 0.0, 4.6, 4.6)
+    rig.tools = replace(rig.tools, look=scale)
+    assert run_session(rig).outcome is Outcome.APPLIED
+    assert "".join(name.split("-")[1] for name in scale.looked) == "122123"
+    first, second = [event["text"] for event in rig.events if event["event"] == "mistake in a block"]
+    assert "DISC was missing" in first
+    assert "if DISC is mounted now, it was there before, too. All of these are recorded again" in second
+
+
+def test_bare_blocks_are_compared_before_any_payload_was_weighed(tmp_path: Path, made_session: MadeSession) -> None:
+    """With `friction_by_payload`, several bare blocks come first."""
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    blocks = [
+        Block(name=f"block-{number}-bare", payload=None, mass_kg=None, holdout=False, plan="") for number in (1, 2, 3)
+    ]
+    left_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.4, added_std_kg=0.05))
+    assert left_on is not None
+    assert left_on.blocks == ("block-3-bare",)
+    assert "take DISC off" in left_on.text
+    was_there = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-4.4, added_std_kg=0.05))
+    assert was_there is not None
+    assert was_there.blocks == ("block-1-bare", "block-2-bare", "block-3-bare")
+    assert "4.4 kg less than in block-1-bare and block-2-bare" in was_there.text
+
+
 def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(tmp_path: Path, made_session: MadeSession) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [
@@ -731,13 +760,13 @@ def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(tmp_path: Path, m
         for n, body in enumerate((None, "disc", "disc", None), 1)
     ]
     assert [block.name for block in compared_with(blocks)] == ["block-1"]
-    mistake = mistake_in(rig.cell, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.05))
+    mistake = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.05))
     assert mistake is not None
     assert mistake.blocks == ("block-4",)
     assert "take DISC off" in mistake.text
-    assert mistake_in(rig.cell, blocks, BlockFacts(added_kg=0.3, added_std_kg=0.05)) is None
+    assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.3, added_std_kg=0.05)) is None
     # A weighing that is too coarse tells nothing.
-    assert mistake_in(rig.cell, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.8)) is None
+    assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.8)) is None
 
 
 def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(tmp_path: Path, made_session: MadeSession) -> None:
@@ -747,12 +776,47 @@ def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(tmp_path: P
         for n, body in enumerate((None, "disc", "disc"), 1)
     ]
     same_mass = BlockFacts(added_kg=0.1, added_std_kg=0.05, added_moment_kg_m=0.5, added_moment_std_kg_m=0.01)
-    turned = mistake_in(rig.cell, blocks, same_mass)
+    turned = mistake_in(rig.cell, PAYLOAD, blocks, same_mass)
     assert turned is not None
     assert turned.blocks == ("block-3",)
     assert "about 109 mm away" in turned.text
-    assert mistake_in(rig.cell, blocks, replace(same_mass, added_moment_kg_m=0.05)) is None
-    assert mistake_in(rig.cell, blocks, replace(same_mass, added_moment_std_kg_m=0.2)) is None
+    assert mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_kg_m=0.05)) is None
+    assert mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_std_kg_m=0.2)) is None
+
+
+def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
+    """The log of the first block was damaged; nothing is wrong with the others."""
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    blocks = [
+        Block(name=f"block-{n}", payload=body, mass_kg=None if body is None else MASS_KG, holdout=False, plan="")
+        for n, body in ((2, "disc"), (3, "disc"), (1, None))
+    ]
+    assert [block.name for block in compared_with(blocks)] == ["block-2", "block-3"]
+    assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-MASS_KG, added_std_kg=0.05)) is None
+    still_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.1, added_std_kg=0.05))
+    assert still_on is not None
+    assert still_on.blocks == ("block-1",)
+    assert still_on.text.endswith("take DISC off.")
+
+
+def test_a_session_goes_on_with_its_own_payload_alone(tmp_path: Path, made_session: MadeSession) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
+    other = {**document["payloads"][0], "name": "ring", "mounting": "ring-a"}
+    rig.cell_file.write_text(json.dumps({**document, "payloads": [*document["payloads"], other]}), encoding="utf-8")
+
+    def stop_before_the_third(payload: str | None) -> None:
+        if len(rig.session.state.runs) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_session(rig, given_answers(rig, put=stop_before_the_third))
+    rig.clock.go_on(minutes=5)
+    with pytest.raises(ConfigurationInconsistent, match="found a session whose blocks carry 'disc'") as caught:
+        run_session(rig, payload="ring")
+    assert "--payload disc" in str(caught.value)
 
 
 def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
@@ -760,10 +824,10 @@ def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
 ) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="")]
-    saturated = mistake_in(rig.cell, blocks, BlockFacts(saturated_percent=(0.0, 0.0, 4.2, 0.0, 0.0, 0.0)))
+    saturated = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(saturated_percent=(0.0, 0.0, 4.2, 0.0, 0.0, 0.0)))
     assert saturated is not None
     assert "J3 was at its current limit for 4.2 %" in saturated.text
-    unreadable = mistake_in(rig.cell, blocks, BlockFacts(unreadable="a jump of 3 rad: see to the encoder"))
+    unreadable = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(unreadable="a jump of 3 rad: see to the encoder"))
     assert unreadable is not None
     assert "see to the encoder" in unreadable.text
 
@@ -771,7 +835,7 @@ def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
 def test_a_mistake_that_stays_ends_the_session_with_what_to_do(tmp_path: Path, made_session: MadeSession) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     rig.tools = replace(rig.tools, look=lambda *_: BlockFacts(unreadable="no encoder: see to it"))
-    with pytest.raises(JobHeld, match="the same mistake in 4 recordings"):
+    with pytest.raises(JobHeld, match="a mistake in 4 recordings"):
         run_session(rig)
     rig.tools = made_session.tools(rig)
     assert run_session(rig).outcome is Outcome.APPLIED
@@ -898,7 +962,7 @@ def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(tmp_path: Path, m
     with pytest.raises(GeometryTurned, match="the mounting: found gravity along"):
         run_session(rig)
     assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
-    assert rig.session.state.outcome is Outcome.STOPPED
+    assert rig.session.state.outcome is Outcome.UNFIT
 
 
 def test_exchanged_currents_ask_for_no_further_block(tmp_path: Path, made_session: MadeSession) -> None:
@@ -911,7 +975,15 @@ def test_exchanged_currents_ask_for_no_further_block(tmp_path: Path, made_sessio
     with pytest.raises(ChannelsExchanged) as caught:
         run_session(rig)
     assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
-    assert caught.value.__notes__[-1] == "hint: the same command then begins a new session"
+    next_step = "correct the wiring or the cell file; the same command then begins a new session"
+    assert caught.value.__notes__[-1] == f"hint: {next_step}"
+    first = rig.session.folder
+    assert next_step in (first / SUMMARY_TEXT).read_text()
+    # The wiring was corrected, and the cell file is what it was: other blocks are recorded.
+    rig.tools = made_session.tools(rig)
+    rig.clock.go_on(minutes=5)
+    assert run_session(rig).outcome is Outcome.APPLIED
+    assert len(rig.sessions) == 2
 
 
 def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(whole_session: tuple[Rig, MadeSession]) -> None:
