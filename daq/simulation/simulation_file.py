@@ -146,6 +146,7 @@ class SimulationModel(StrictModel):
     start_mm: tuple[float | None, ...] = ()
     axes: Annotated[tuple[AxisSpec, ...], Field(min_length=1, max_length=32)]
     payloads: dict[str, Body] = Field(default_factory=dict)
+    tuned_with: str | None = None  #: body that the loops are tuned to carry, and to do without
     effects: tuple[PlantedEffectModel, ...] = ()
     faults: tuple[FaultModel, ...] = ()
     closures: tuple[Closure, ...] = ()
@@ -219,6 +220,7 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
         assembly_rad={name: DEGREE.si * degrees for name, degrees in model.assembly_deg.items()}
         | {name: MILLIMETRE.si * millimetres for name, millimetres in model.assembly_mm.items()},
         passive=model.passive,
+        tuned_with=None if model.tuned_with is None else model.payloads[model.tuned_with],
     )
 
 
@@ -264,6 +266,9 @@ def _check(document: Document, model: SimulationModel) -> None:
         for index, effect in enumerate(model.effects)
         if effect.axis is not None and axis_index(effect.axis) >= n
     ]
+    if model.tuned_with is not None and model.tuned_with not in model.payloads:
+        names = ", ".join(model.payloads) or "none: it has no payloads"
+        faults.append(Fault(("tuned_with",), repr(model.tuned_with), f"one of {names}"))
     faults += absent_axes(model.faults, n)
     faults += _implausible(model)
     if faults:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,21 +72,33 @@ def counts_per_rad(spec: CellSpec) -> FloatArray:
 def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
     """Return the current per motor acceleration [A per count/s²] to which the loops are tuned, shape (n,).
 
-    It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, signed as the
-    axis is wired. A closed chain has only the posture of its start: in others its loops would have to be closed.
+    It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, and without
+    and with `CellSpec.tuned_with`, signed as the axis is wired. A closed chain has only the posture of its start: in
+    others its loops would have to be closed.
     """
-    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
-    swept = range(1, 1 if spec.closures else min(len(spec.axes), 7))
-    tried = plant.postures(spec.start_rad, POSTURES)
-    inertias = []
-    for posture in itertools.product(*(tried[joint] for joint in swept)):
-        position = spec.start_rad.copy()
-        position[list(swept)] = posture
-        inertias.append(plant.motor_inertia_at(position))
+    bodies = [spec.payload] if spec.tuned_with is None else [None, spec.tuned_with]
+    inertias: list[FloatArray] = []
+    for body in bodies:
+        plant.mount(replace(spec, payload=body))
+        inertias += _inertias(spec, plant)
+    plant.mount(spec)
     inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
     gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
     # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring together.
     return np.asarray(inertia / (gain * reduction(spec.ratio) * counts_per_rad(spec)))
+
+
+def _inertias(spec: CellSpec, plant: Plant) -> list[FloatArray]:
+    """Inertia that each motor meets in postures of the arm with what is mounted, shape (m,) each."""
+    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
+    swept = range(1, 1 if spec.closures else min(len(spec.axes), 7))
+    tried = plant.postures(spec.start_rad, POSTURES)
+    inertias: list[FloatArray] = []
+    for posture in itertools.product(*(tried[joint] for joint in swept)):
+        position = spec.start_rad.copy()
+        position[list(swept)] = posture
+        inertias.append(plant.motor_inertia_at(position))
+    return inertias
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,6 +136,9 @@ class CellSpec:
     platform: str | None = None  #: link that carries the payload, or None for the last joint
     assembly_rad: Mapping[str, float] = field(default_factory=dict)  #: rough position of every joint [rad or m]
     passive: Mapping[str, PassiveFriction] = field(default_factory=dict)  #: by the names of the other joints
+    #: Body that the loops are tuned to carry, and to do without; None for loops that are tuned with what is mounted
+    #: at power-on.
+    tuned_with: Body | None = None
 
 
 class SimulationError(DriverError):

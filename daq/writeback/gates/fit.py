@@ -52,8 +52,8 @@ def configuration(context: GateContext) -> Iterator[GateFinding]:
             "calibration",
             f"recorded with cell configuration {found[:12] or 'unknown'}…",
             f"{expected[:12]}…, the cell's configuration now",
-            "fit the same logs with this cell file (--cell), record again, or see what changed since and accept it with "
-            "--configuration-changed",
+            "fit the same logs with this cell file (--cell), record again, or see what changed since and accept it "
+            "with --configuration-changed",
         )
 
 

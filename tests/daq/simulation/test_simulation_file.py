@@ -35,6 +35,7 @@ def test_an_unknown_payload_is_refused(checkout: Path) -> None:
     ("old", "new", "kind", "message"),
     [
         ("axis: J3", "axis: J9", ConfigurationInconsistent, "J1 to J6"),
+        ("substeps:", "tuned_with: anvil\nsubsteps:", ConfigurationInconsistent, "tuned_with: found 'anvil'"),
         ("axis: J3", "axis: elbow", SchemaMismatch, r"effects\[0\].axis"),
         ("start_deg: [0.0, ", "start_deg: [", ConfigurationInconsistent, "5 angles"),
         ("serial: 1001", "serail: 1001", SchemaMismatch, "serial"),
