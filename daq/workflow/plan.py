@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
 from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
-from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError
+from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError, counted
 from daq.files import replace_file
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
 from daq.workflow.experiment import (
@@ -389,7 +389,8 @@ class Search:
             if obstruction is not None:
                 blocking.append(obstruction)
         if self._too_heavy > self._obstructed:
-            found += f": also slowly, they ask too much torque of {' and '.join(self._too_weak())}"
+            axes = " and ".join(self._too_weak()) or "some axis"
+            found += f": also slowly, they ask too much torque of {axes}"
             expected = f"at most the `effort` of the URDF over {EFFORT_MARGIN:g}"
             remedy = "correct `effort` in the URDF, declare a lighter payload, or narrow the joint limits"
             return _unfit(self._cell, self._duration_s, found, expected, remedy)
@@ -804,10 +805,10 @@ these moves before."""
 
 
 def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[tuple[PlannedMove, ...], str]:
-    """Return the moves before those of a plan that lead the robot around what is in its way, and a remark.
+    """Return the moves to the first target of a plan, and a remark where it is more than one.
 
-    There are none where the straight way to the first target is clear. The others stay between the joint positions of
-    the plan and the one where the robot stands.
+    Where the straight way is clear, it is the first move of the plan. Else slow moves lead around what is in the way,
+    between the joint positions of the plan and the one where the robot stands.
 
     Args:
         cell: with `workspace`, `clearance` or closures; without any, nothing is known of the room.
@@ -817,14 +818,14 @@ def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[
     Raises:
         MotionRefused: no clear way was found; with the place and the bodies that come too close on the straight one.
     """
-    if not _is_bounded(cell):
-        return (), ""
-    checker = _checker(cell)
     first = plan.moves[0]
+    if not _is_bounded(cell):
+        return (first,), ""
+    checker = _checker(cell)
     target = np.array(first.target_rad)
     blocked = checker.obstruction(start_rad, target)
     if blocked is None:
-        return (), ""
+        return (first,), ""
     positions = np.array([start_rad, *(move.target_rad for move in plan.moves)])
     lower = positions.min(axis=0)
     upper = positions.max(axis=0)
@@ -835,18 +836,13 @@ def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[
             f"between the positions of the plan; bring the robot near the first target by hand, or correct "
             f"{_keys(blocked)} in the cell file"
         )
-    slow = replace(
-        first,
-        velocity=min(first.velocity, AROUND),
-        acceleration=min(first.acceleration, AROUND),
-        dwell_s=DWELL_S,
-    )
-    moves = tuple(replace(slow, target_rad=tuple(turn.tolist())) for turn in turns)
+    slow = replace(first, velocity=min(first.velocity, AROUND), acceleration=min(first.acceleration, AROUND))
+    moves = [replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S) for turn in turns]
     remark = (
         f"the straight way from where the robot stood to the first target of the plan is not clear "
-        f"({_spell(cell, blocked)}): {len(moves)} slow moves led around it"
+        f"({_spell(cell, blocked)}): slow moves led around it, by {counted(len(turns), 'further position')}"
     )
-    return moves, remark
+    return (*moves, slow), remark
 
 
 def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) -> None:

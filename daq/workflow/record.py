@@ -552,13 +552,13 @@ def _start(
 def _checked_moves(
     cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int], permission: MotionPermission
 ) -> tuple[tuple[Move, ...], tuple[str, ...]]:
-    """Convert a plan to motor moves that keep the limits, behind those to its first target, and remarks about these.
+    """Convert a plan to motor moves that keep the limits, with a clear way to its first target, and remarks about it.
 
     Raises:
         MotionRefused: they do not keep the limits, or no way to the first target is clear.
     """
-    before, remark = way_to_first_target(cell, plan, scale.joint_position(np.array(start_counts)))
-    whole = replace(plan, moves=(*before, *plan.moves))
+    to_first, remark = way_to_first_target(cell, plan, scale.joint_position(np.array(start_counts)))
+    whole = replace(plan, moves=(*to_first, *plan.moves[1:]))
     moves = motor_moves(cell, whole, scale, start_counts)
     check_moves(start_counts, moves, permission, cell.axis_names)
     return moves, (remark,) if remark else ()

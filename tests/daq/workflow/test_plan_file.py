@@ -65,7 +65,8 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
         "  - {target_deg: [0, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.1}\n"
     )
     path.write_text(text)
-    assert way_to_first_target(cell, load_plan(path, cell), np.radians([0.3, 0.0, 0.0, 0.0])) == ((), "")
+    read = load_plan(path, cell)
+    assert way_to_first_target(cell, read, np.radians([0.3, 0.0, 0.0, 0.0])) == (read.moves, "")
     with pytest.raises(MotionRefused, match=r"the loops do not close, or are close to a singularity, at .*closures"):
         way_to_first_target(cell, load_plan(path, cell), np.radians([0.0, 8.0, 0.0, 0.0]))
     path.write_text(text + "  - {target_deg: [0, 12, 0, 0], velocity: 0.5, acceleration: 0.5}\n")
