@@ -20,6 +20,7 @@ from daq.jobs.session import CALIBRATION, Session
 from daq.jobs.stages import calibration_made
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import read_history
+from daq.workflow.experiment import experiment_of
 from daq.workflow.validate import Validation
 from ident.calibration import Calibration
 
@@ -60,7 +61,8 @@ class Accept:
         last = guided(session).blocks[-1]
         path = session.folder / f"plan-{RUN}.yaml"
         body = next(block.payload for block in guided(session).blocks if block.payload is not None)
-        made, _ = plan_with_room(context, body, context.settings.seed + SEED_STEP, self.duration_s)
+        experiment = experiment_of(context.cell, body)
+        made, _ = plan_with_room(context, experiment, context.settings.seed + SEED_STEP, self.duration_s)
         plan = write_plan(context, path, made)
         say_moves(context, RUN, path)
         planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)

@@ -8,12 +8,12 @@ tells nothing, so gravity and the positions are judged before a body is blamed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from daq.config.cell import Cell, model_of
+from daq.config.cell import Cell, WeighedPayload, model_of
 from daq.documents.session_state import Block
 from daq.errors import DataError
 from daq.log.conversion import load_run
@@ -127,26 +127,16 @@ def mistake_in(
     limited = _limited(cell, facts)
     if limited:
         return Mistake((last.name,), limited, is_of_body=False)
-    declared_kg = next(body.mass_kg for body in cell.payloads if body.name == payload)
+    body = next(one for one in cell.payloads if one.name == payload)
     weighed_kg = [block.mass_kg for block in blocks if block.payload is not None and block.mass_kg]
-    body = _Body(payload, weighed_kg[-1] if weighed_kg else declared_kg)
+    if weighed_kg:
+        body = replace(body, mass_kg=weighed_kg[-1])
     return _mistake_of_body(blocks, body, facts, is_again=last.name in repeated)
 
 
-@dataclass(frozen=True, slots=True)
-class _Body:
-    """What the loaded blocks carry."""
-
-    name: str
-    mass_kg: float
-
-    @property
-    def shown(self) -> str:
-        """Its name in a message."""
-        return self.name.upper()
-
-
-def _mistake_of_body(blocks: Sequence[Block], body: _Body, facts: BlockFacts, *, is_again: bool) -> Mistake | None:
+def _mistake_of_body(
+    blocks: Sequence[Block], body: WeighedPayload, facts: BlockFacts, *, is_again: bool
+) -> Mistake | None:
     """Judge the body on the flange in the last block by its weight beyond `compared_with`."""
     added_kg = facts.added_kg
     noise_kg = LEAST_SIGMAS * facts.added_std_kg
@@ -177,13 +167,16 @@ def _limited(cell: Cell, facts: BlockFacts) -> str:
     return ""
 
 
-def _bare_beside_bare(blocks: Sequence[Block], body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+def _bare_beside_bare(
+    blocks: Sequence[Block], body: WeighedPayload, added_kg: float, least_kg: float
+) -> Mistake | None:
     """Judge a bare block beside earlier bare ones."""
     if abs(added_kg) <= least_kg:
         return None
     last = blocks[-1]
     if added_kg > 0.0:
-        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {body.shown} off."
+        name = body.name.upper()
+        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {name} off."
         return Mistake((last.name,), text)
     earlier = tuple(block.name for block in compared_with(blocks))
     text = (
@@ -193,12 +186,13 @@ def _bare_beside_bare(blocks: Sequence[Block], body: _Body, added_kg: float, lea
     return Mistake((*earlier, last.name), text)
 
 
-def _loaded_beside_loaded(last: Block, body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+def _loaded_beside_loaded(last: Block, body: WeighedPayload, added_kg: float, least_kg: float) -> Mistake | None:
     """Judge a loaded block beside earlier loaded ones."""
     if abs(added_kg) <= least_kg:
         return None
     change = f"{abs(added_kg):.2g} kg {'more' if added_kg > 0.0 else 'less'}"
-    text = f"The flange carried about {change} than in the loaded blocks before: mount {body.shown}, as it was then."
+    name = body.name.upper()
+    text = f"The flange carried about {change} than in the loaded blocks before: mount {name}, as it was then."
     return Mistake((last.name,), text)
 
 
@@ -217,16 +211,16 @@ def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
     return Mistake((last.name,), text)
 
 
-def _bare_beside_loaded(last: Block, body: _Body, added_kg: float, least_kg: float) -> Mistake | None:
+def _bare_beside_loaded(last: Block, body: WeighedPayload, added_kg: float, least_kg: float) -> Mistake | None:
     """Judge a bare block beside loaded ones, as the first bare block that is recorded again."""
     if abs(added_kg) > least_kg:
         return None
-    text = f"The flange carried the same as in the loaded blocks before: take {body.shown} off."
+    text = f"The flange carried the same as in the loaded blocks before: take {body.name.upper()} off."
     return Mistake((last.name,), text)
 
 
 def _loaded_beside_bare(
-    blocks: Sequence[Block], body: _Body, added_kg: float, least_kg: float, *, is_again: bool
+    blocks: Sequence[Block], body: WeighedPayload, added_kg: float, least_kg: float, *, is_again: bool
 ) -> Mistake | None:
     """Judge the first loaded block beside the bare ones.
 
@@ -234,28 +228,29 @@ def _loaded_beside_bare(
     more, the body was there in the bare ones.
     """
     last = blocks[-1]
+    name = body.name.upper()
     everything = tuple(block.name for block in blocks)
     bare = " and ".join(everything[:-1])
     again = "All of these are recorded again, those before the last one without anything on the flange."
-    if abs(added_kg) <= least_kg and not is_again:
-        text = f"The flange carried the same as in {bare}: {body.shown} was missing. Mount it."
-        return Mistake((last.name,), text)
-    if abs(added_kg) <= least_kg:
+    is_same = abs(added_kg) <= least_kg
+    if is_same and not is_again:
+        return Mistake((last.name,), f"The flange carried the same as in {bare}: {name} was missing. Mount it.")
+    if is_same:
         text = (
-            f"The flange carried the same as in {bare} once more: if {body.shown} is mounted now, it was there before, "
-            f"too. {again}"
+            f"The flange carried the same as in {bare} once more: if {name} is mounted now, it was there before, too. "
+            f"{again}"
         )
         return Mistake(everything, text)
     if added_kg < 0.0:
         text = (
             f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more without load than with "
-            f"{body.shown}: the two were exchanged. {again}"
+            f"{name}: the two were exchanged. {again}"
         )
         return Mistake(everything, text)
     lower, upper = SAME_BODY
     if not lower <= added_kg / body.mass_kg <= upper:
         text = (
-            f"The flange carried about {added_kg:.2g} kg by the nameplate gains, and {body.shown} has "
+            f"The flange carried about {added_kg:.2g} kg by the nameplate gains, and {name} has "
             f"{body.mass_kg:g} kg: another body was mounted, or the nameplate is far off."
         )
         return Mistake((last.name,), text)

@@ -31,6 +31,7 @@ from daq.jobs.session import Basis, Session
 from daq.jobs.stages import TO_DECISION, Certify, Stage, run_stages
 from daq.ledger.audit import AuditAction
 from daq.workflow.bus_lock import bus_lock
+from daq.workflow.experiment import experiment_of
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriverError, all_notes
 
@@ -202,9 +203,10 @@ def _ready_text(context: SessionContext) -> str:
 
 
 def _predicted_text(context: SessionContext, payload: str | None, block_s: float) -> str:
-    declared = [one.name for one in context.cell.payloads]
-    body = payload if payload in declared else None  # the line of the payload says so
-    plan, _ = plan_with_room(context, body, context.settings.seed, block_s)
+    if payload not in [one.name for one in context.cell.payloads]:
+        payload = None  # the line of the payload says so
+    experiment = experiment_of(context.cell, payload)
+    plan, _ = plan_with_room(context, experiment, context.settings.seed, block_s)
     predicted = zip(context.cell.axis_names, plan.predicted_std_percent, strict=True)
     listed = ", ".join(f"{axis} {std:.2f} %" for axis, std in predicted)
     return f"predicted σ after one bare and one loaded block: {listed}"

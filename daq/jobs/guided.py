@@ -17,6 +17,7 @@ import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -313,14 +314,12 @@ class UntilPrecise:
             context,
             session,
             number,
-            speed=room.speed,
-            acceleration=room.acceleration,
+            outlook.experiment(experiment, is_loaded=is_loaded, room=room),
+            room,
             # More moves never make what is known worse.
             largest_condition=np.inf,
             largest_std_percent=np.inf,
-            experiment=outlook.experiment(experiment, is_loaded=is_loaded, room=room),
             goal=outlook.goal(self.settings.target_percent),
-            box=room.box,
         )
         worst = estimate.worst
         axis = context.cell.axis_names.index(worst.axis)
@@ -345,27 +344,32 @@ class UntilPrecise:
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
         inside = replace(experiment, scene=room.scene(experiment.scene))
-        session, made = self._with_room(
-            context,
-            session,
-            number,
-            speed=room.speed,
-            acceleration=room.acceleration,
-            experiment=inside,
-            box=room.box,
-        )
+        session, made = self._with_room(context, session, number, inside, room)
         return session, write_plan(context, path, made)
 
     def _with_room(
-        self, context: SessionContext, session: Session, number: int, **further: Any
+        self,
+        context: SessionContext,
+        session: Session,
+        number: int,
+        experiment: Experiment,
+        accepted: AcceptedRoom | None = None,
+        **further: Any,
     ) -> tuple[Session, Plan]:
-        """Make the moves of a block by its number from 0; where they have to be longer, those of later blocks are, too.
+        """Make the moves of a block; where they have to be longer, those of later blocks are, too.
 
-        ``further`` are arguments of the planner.
+        Args:
+            context: of the session.
+            session: with the length of its blocks.
+            number: of the block, from 0.
+            experiment: that the moves are for.
+            accepted: room and speed that they keep; None for the first blocks.
+            **further: arguments of the planner.
         """
+        if accepted is not None:
+            further |= {"speed": accepted.speed, "acceleration": accepted.acceleration, "box": accepted.box}
         block_s = self.block_s(guided(session))
-        seed = self.settings.seed + number
-        plan, taken_s = plan_with_room(context, self.settings.payload, seed, block_s, **further)
+        plan, taken_s = plan_with_room(context, experiment, self.settings.seed + number, block_s, **further)
         if taken_s > block_s:
             session = session.update(block_s=taken_s)
         return session, plan
@@ -407,7 +411,8 @@ class UntilPrecise:
         self, context: SessionContext, session: Session, name: str, number: int, path: Path
     ) -> tuple[Session, Plan]:
         """Make the moves of one of the first blocks by its name, and its number from 0."""
-        session, made = self._with_room(context, session, number)
+        experiment = experiment_of(context.cell, self.settings.payload)
+        session, made = self._with_room(context, session, number, experiment)
         plan = write_plan(context, path, made)
         say_moves(context, name, path)
         return session, plan
@@ -522,28 +527,28 @@ def _refuse_geometry(diagnoses: Sequence[Diagnosis]) -> None:
 
 
 def plan_with_room(
-    context: SessionContext, payload: str | None, seed: int, duration_s: float, **further: Any
+    context: SessionContext, experiment: Experiment, seed: int, duration_s: float, **further: Any
 ) -> tuple[Plan, float]:
     """Make a plan, of twice the duration where it has no room for enough moves, and so on; return both.
 
     Args:
         context: of the session.
-        payload: name of the body that the moves are made with, beside those without load; None for the first one.
+        experiment: that the moves are for.
         seed: of the moves.
         duration_s: asked for.
-        **further: arguments of the planner; without an ``experiment``, the plan is for one bare and one loaded run.
+        **further: arguments of the planner.
 
     Raises:
         PlanTooShort: even the longest one has no room.
         UsageError, ConfigurationInconsistent: there are no such moves.
     """
-    further.setdefault("experiment", experiment_of(context.cell, payload))
+    make = partial(context.tools.plan, context.cell, seed=seed, experiment=experiment, **further)
     longest_s = duration_s * 2.0**MOST_DOUBLINGS
     taken_s = duration_s
     while True:
         context.journal.say(Level.INFO, "planning", seed=seed, duration_s=taken_s)
         try:
-            return context.tools.plan(context.cell, seed=seed, duration_s=taken_s, **further), taken_s
+            return make(duration_s=taken_s), taken_s
         except PlanTooShort as error:
             if taken_s >= longest_s:
                 raise

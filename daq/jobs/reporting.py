@@ -27,7 +27,7 @@ from daq.ledger.ledger import MAY_LACK, read_history, record_session
 from daq.report.document import json_text
 from daq.report.job_schemas import JobReport, RefusedJob, SessionReport
 from daq.report.residual_page import PAGE
-from daq.workflow.diagnoses import HIDING_EXCHANGES
+from daq.writeback.gates.fit import OF_DESCRIPTION
 from drivers.errors import stop_notes
 from ident.calibration import Calibration
 from ident.errors import Diagnosis
@@ -75,8 +75,9 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
         code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
         problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         remark = "; ".join((problem, *stop_notes(error)))
-        is_guided = isinstance(session.state, GuidedState)
-        next_step = next_step_after(error, context.file, session) if is_guided else ""
+        next_step = ""
+        if isinstance(session.state, GuidedState):
+            next_step = next_step_after(error, context.file, session)
         _report(context, Conclusion(outcome, int(code), session, remark, next_step), session, problem)
     except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
@@ -300,7 +301,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     steps = _steps(conclusion, cell_file)
     diagnoses = _diagnoses(conclusion)
     checks = [f"CHECK {one.subject}: {one.remedy}" for one in diagnoses]
-    is_described_wrongly = any(one.name in HIDING_EXCHANGES for one in diagnoses)
+    is_described_wrongly = any(one.name in OF_DESCRIPTION for one in diagnoses)
     session = conclusion.session
     if is_described_wrongly and session is not None and isinstance(session.state, GuidedState):
         command = fit_corrected_command(cell_file, session)

@@ -799,7 +799,7 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
 
 
-AROUND = 0.25
+AROUND_SHARE = 0.25
 """Largest share of the limits at which a robot goes around what is in its way to the first target: no one has seen
 these moves before."""
 
@@ -836,7 +836,9 @@ def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[
             f"between the positions of the plan; bring the robot near the first target by hand, or correct "
             f"{_keys(blocked)} in the cell file"
         )
-    slow = replace(first, velocity=min(first.velocity, AROUND), acceleration=min(first.acceleration, AROUND))
+    slow = replace(
+        first, velocity=min(first.velocity, AROUND_SHARE), acceleration=min(first.acceleration, AROUND_SHARE)
+    )
     moves = [replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S) for turn in turns]
     remark = (
         f"the straight way from where the robot stood to the first target of the plan is not clear "

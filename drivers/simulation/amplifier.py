@@ -76,12 +76,12 @@ def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
     and with `CellSpec.tuned_with`, signed as the axis is wired. A closed chain has only the posture of its start: in
     others its loops would have to be closed.
     """
-    bodies = [spec.payload] if spec.tuned_with is None else [None, spec.tuned_with]
-    inertias: list[FloatArray] = []
-    for body in bodies:
-        plant.mount(replace(spec, payload=body))
-        inertias += _inertias(spec, plant)
-    plant.mount(spec)
+    if spec.tuned_with is None:
+        inertias = _inertias(spec, plant)
+    else:
+        bare = replace(spec, payload=None)
+        loaded = replace(spec, payload=spec.tuned_with)
+        inertias = _inertias(spec, Plant(bare)) + _inertias(spec, Plant(loaded))
     inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
     gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
     # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring together.

@@ -24,7 +24,7 @@ from ident.arrays import FloatArray
 from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
-from ident.discovery.gates import Gates, impossible, in_noise, is_certain_delay, own_unknowns
+from ident.discovery.gates import Gates, certain_delays, impossible, in_noise, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import (
     Delay,
@@ -379,7 +379,7 @@ def _suspects(
     passed = [found for found in findings if found.passed]
     for found in passed:
         is_late = isinstance(found.effect, LatePosition)
-        if is_late and not is_certain_delay(found.coefficients, found.deviations):
+        if is_late and not certain_delays(found.coefficients, found.deviations).all():
             continue
         if not isinstance(found.effect, Delay):
             torque_nm = problem.torque_at_rows(found.effect, found.axis)

@@ -27,10 +27,10 @@ from ident.discovery.gates import (
     CERTAIN_DELAY_SIGMAS,
     Gates,
     PartsLeftOut,
+    certain_delays,
     gain_shifts,
     impossible,
     in_noise,
-    is_certain_delay,
     moved_gains,
     own_unknowns,
     runs_to_leave_out,
@@ -317,10 +317,10 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
 def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
     is_delay = isinstance(placed.effect, Delay | LatePosition)
-    sizes = gates
+    limits = gates
     if is_delay:
         # A delay is judged by its length: beside dry friction it is a small part of a motor's residual.
-        gates = replace(gates, explained=0.0, error_fall=0.0)
+        limits = replace(gates, explained=0.0, error_fall=0.0)
     estimate = model.evidence.estimate
     reduced = without_effects_of(model.search_problem, estimate, (placed,))
     problem, columns = reduced.search_problem, reduced.columns
@@ -329,18 +329,25 @@ def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generato
     members = tuple((form, trial) for form, trial in zip(forms, trials, strict=True) if trial is not None)
     if not members:
         return 0.0, "the model contains it already"
-    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, gates)
+    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, limits)
     own = own_unknowns(estimate, (placed,))
     values = values_of(estimate, own)
     place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     deviations = estimate.parameters_std[own]
-    is_small = finding.explained < sizes.explained or finding.error_fall < sizes.error_fall
     uncertain = ""
-    if is_delay and is_small and not is_certain_delay(values, deviations):
-        uncertain = f"it explains little, and is less than {CERTAIN_DELAY_SIGMAS:g} σ from zero"
+    if is_delay:
+        uncertain = _uncertain_delay(finding, values, deviations, gates)
     physics = impossible(placed.effect.coefficients, values, deviations)
     is_of_speed = isinstance(placed.effect, SpeedFriction)
     drives = pushing(model.evidence, placed.axis) if is_of_speed else ""
     reasons = (*finding.refusals, joint, uncertain, physics, drives, PartsLeftOut.of(problem).refusal(columns))
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
+
+
+def _uncertain_delay(finding: Finding, seconds: FloatArray, deviations: FloatArray, gates: Gates) -> str:
+    """Why a delay of a joint fit may not stay; empty where it explains much, or is far from zero."""
+    is_small = finding.explained < gates.explained or finding.error_fall < gates.error_fall
+    if not is_small or certain_delays(seconds, deviations).all():
+        return ""
+    return f"it explains little, and is less than {CERTAIN_DELAY_SIGMAS:g} σ from zero"

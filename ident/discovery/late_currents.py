@@ -16,7 +16,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem
 from ident.discovery.evidence import Evidence, coefficients_of, with_effects
-from ident.discovery.gates import CERTAIN_DELAY_SIGMAS
+from ident.discovery.gates import certain_delays
 from ident.effects.effect import PlacedEffect, at_joints
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.signals import fitted_signals, session_began_s
@@ -113,10 +113,9 @@ def find_late_currents(
     if trial is None:
         return None
     seconds = trial.coefficients
-    covariance = trial.covariance
     # Of fewer currents, nothing says that the others are late by the same time.
     are_all_tested = 2 <= len(lags) == problem.axes
-    if skews and are_all_tested and _are_alike(seconds, covariance):
+    if skews and are_all_tested and _are_alike(seconds, trial.covariance):
         effect, of_skew = skews[0].members[0]
         placed = PlacedEffect(effect, skews[0].axis)
         return LateCurrents(
@@ -125,7 +124,7 @@ def find_late_currents(
             seconds=of_skew.coefficients,
             held_out=of_skew.held_out.sum(axis=1),
         )
-    late = np.flatnonzero(np.abs(seconds) > CERTAIN_DELAY_SIGMAS * np.sqrt(np.diag(covariance)))
+    late = np.flatnonzero(certain_delays(seconds, trial.deviations))
     if not len(late):
         return None
     own = columns[:, late]

@@ -156,22 +156,18 @@ def find_effects(
         mistakes = _named_mistakes(start, rng, gates) if geometry else ()
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
     delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
-    described = start
+    corrected = start
     aside: list[SetAside] = []
     if corrections:
         progress("adding what the check of the description has named")
-        model = linearised(start, ColumnCache())
-        corrected = join_mistakes(model, corrections, rng, gates)
-        steps += _steps_of(corrected, mistakes, detection_limits_nm(model.search_problem, gates))
-        aside += corrected.set_aside
-        described = corrected.model.evidence
-        del model, corrected  # a linearised problem is large, and the search makes its own
-    seen = {keys_of(start), keys_of(described)}
+        steps, corrected, refused = _corrected(start, mistakes, corrections, rng, gates)
+        aside += refused
+    seen = {keys_of(start), keys_of(corrected)}
 
     def search(start: Evidence, most: int) -> tuple[list[Step], JointFit]:
         return _searched(start, most, rng, gates, (*geometry, *families), seen, progress, names)
 
-    found, model = search(described, MAX_EFFECTS)
+    found, model = search(corrected, MAX_EFFECTS)
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
         late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
@@ -186,6 +182,19 @@ def find_effects(
     last = end_search(steps, model, gates, rng=rng)
     not_joined = [one for one in aside if one.finding.placed not in last.after.effects]
     return (*steps[:-1], replace(last, set_aside=(*not_joined, *last.set_aside)))
+
+
+def _corrected(
+    start: Evidence, mistakes: Sequence[Finding], corrections: Sequence[Finding], rng: np.random.Generator, gates: Gates
+) -> tuple[list[Step], Evidence, tuple[SetAside, ...]]:
+    """Join corrections of the description: a turn for each that joins, the model with them, and what does not join.
+
+    The linearised problem ends here: it is large, and the search makes its own.
+    """
+    model = linearised(start, ColumnCache())
+    joined = join_mistakes(model, corrections, rng, gates)
+    steps = _steps_of(joined, mistakes, detection_limits_nm(model.search_problem, gates))
+    return steps, joined.model.evidence, joined.set_aside
 
 
 def _searched(
@@ -225,7 +234,7 @@ def _named_mistakes(start: Evidence, rng: np.random.Generator, gates: Gates) -> 
 
 
 def _steps_of(corrected: JoinedMistakes, mistakes: Sequence[Finding], limits_nm: FloatArray) -> list[Step]:
-    """A turn for each mistake that has joined; the check has told it apart from everything else."""
+    """A turn for each mistake that has joined. It has no rivals: the check has compared it with all of them."""
     steps: list[Step] = []
     for found, after in zip(corrected.joined, corrected.models, strict=True):
         steps.append(Step(tuple(mistakes), (), limits_nm, replace(found, ambiguity=()), after))

@@ -33,7 +33,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
-from ident.discovery.gates import SIGMAS, Gates, impossible, is_certain_delay
+from ident.discovery.gates import SIGMAS, Gates, certain_delays, impossible
 from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
@@ -264,7 +264,7 @@ def _judge(
     # A small mistake of the geometry is spread over all motors, and bends their gains.
     may_be_small = isinstance(effect, GeometryEffect)
     if isinstance(effect, LatePosition):
-        may_be_small = is_certain_delay(trial.coefficients, trial.deviations)
+        may_be_small = bool(certain_delays(trial.coefficients, trial.deviations).all())
     strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
     false_alarm = gates.strong_false_alarm if strong else gates.false_alarm
     chance = None if np.isnan(probability[best]) else float(probability[best])

@@ -12,7 +12,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.planning.clearance import Checker
 
-MOST_BRANCHES = 200  #: Of both trees; in the shipped cells ten were enough
+MOST_BRANCHES = 200  #: Of both trees
 SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  #: Of the way to a position, the first that is clear is gone
 SAME = 1e-9  #: Distance of two positions that are the same, as a share of the room
 

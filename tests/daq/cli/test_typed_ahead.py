@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pty
 import sys
@@ -10,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 
@@ -19,16 +19,22 @@ from daq.errors import JobHeld
 SECONDS_TO_WAIT = 20.0  #: For what takes milliseconds
 
 
-class SessionSide(io.TextIOWrapper):
-    """The session's side of a terminal, which tells when a line is waited for."""
+class SessionSide:
+    """The session's side of a terminal, in the place of `sys.stdin`, which tells when a line is waited for."""
 
-    def __init__(self, side: int) -> None:
-        super().__init__(io.BufferedReader(io.FileIO(side)), encoding="utf-8")
+    def __init__(self, side: TextIO) -> None:
         self.is_read = threading.Event()
+        self._side = side
 
-    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+    def isatty(self) -> bool:
+        return self._side.isatty()
+
+    def fileno(self) -> int:
+        return self._side.fileno()
+
+    def readline(self) -> str:
         self.is_read.set()
-        return super().readline(size)
+        return self._side.readline()
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,8 @@ class Terminal:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     """A terminal in the place of this process' input."""
     operator_side, session_side = pty.openpty()
-    with SessionSide(session_side) as side:
+    with os.fdopen(session_side, encoding="utf-8") as opened:
+        side = SessionSide(opened)
         monkeypatch.setattr(sys, "stdin", side)
         yield Terminal(operator_side, side)
     os.close(operator_side)

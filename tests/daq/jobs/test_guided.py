@@ -39,7 +39,7 @@ from daq.errors import (
     UsageError,
 )
 from daq.jobs import calibrate as guided_session
-from daq.jobs import job
+from daq.jobs import job, reporting
 from daq.jobs.acceptance import TOLERANCE, Accept
 from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, look_at_geometry, mistake_in
 from daq.jobs.block_order import FIRST_BLOCKS
@@ -58,7 +58,7 @@ from daq.workflow.fit import Fit
 from daq.workflow.plan import Plan, load_plan, plan
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
-from ident.errors import ChannelsExchanged, Diagnosis, GeometryTurned
+from ident.errors import CORRECTION_UNCLEAR, ChannelsExchanged, Diagnosis, GeometryTurned
 from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
@@ -928,6 +928,24 @@ def test_what_the_fit_says_to_check_is_to_do(tmp_path: Path, made_session: MadeS
     assert to_do(ended, rig.cell_file)[-1] == "CHECK J2: declare its delay"
     unchanged = replace(ended, outcome=Outcome.UNCHANGED)
     assert to_do(unchanged, rig.cell_file) == ["CHECK J2: declare its delay"]
+
+
+@pytest.mark.parametrize(("name", "is_mended"), [("zero-off", True), (CORRECTION_UNCLEAR, False)])
+def test_a_wrong_description_is_to_be_corrected_before_anything_is_applied(
+    tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch, name: str, is_mended: bool
+) -> None:
+    """Where two corrections are alike, none is to be made, and no blocks are fitted with it."""
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    ended = run_session(rig)
+    wrong = Diagnosis(name, (), ("J2",), "the zero of J2 off by 2°", "that of the URDF", "see to J2")
+    calibration = replace(made_session.calibration, diagnoses=(wrong,))
+    monkeypatch.setattr(reporting, "calibration_of_session", lambda _: calibration)
+    proposed = replace(ended, outcome=Outcome.PROPOSED)
+    steps = to_do(proposed, rig.cell_file)
+    applying = next(number for number, step in enumerate(steps) if step.startswith("drivegain apply"))
+    assert (steps.index("CHECK J2: see to J2") < applying) is is_mended
+    refits = [step for step in steps if step.startswith("with the corrected file")]
+    assert len(refits) == int(is_mended)
 
 
 TURNED = Diagnosis("gravity-turned", (), (), "gravity along [0, 1, 0]", "gravity along [0, 0, -1]", "correct it")

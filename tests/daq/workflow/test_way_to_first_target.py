@@ -13,7 +13,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.workflow.experiment import PlannedMove, scene_of
-from daq.workflow.plan import AROUND, Plan, plan, way_to_first_target
+from daq.workflow.plan import AROUND_SHARE, Plan, plan, way_to_first_target
 from drivers.errors import MotionRefused
 from ident.model.urdf import robot_from_urdf
 from ident.planning.clearance import Box, Checker
@@ -68,7 +68,7 @@ def test_slow_moves_lead_around_a_wall_between_the_positions_of_the_plan(walled:
     corners = np.array([LEFT, RIGHT, ABOVE])
     assert np.all(way >= corners.min(axis=0))
     assert np.all(way <= corners.max(axis=0))
-    assert {(move.velocity, move.acceleration) for move in moves} == {(AROUND, AROUND)}
+    assert {(move.velocity, move.acceleration) for move in moves} == {(AROUND_SHARE, AROUND_SHARE)}
     assert "slow moves led around it, by " in remark
 
 

@@ -114,7 +114,7 @@ def test_the_loops_are_tuned_over_the_travel_of_a_prismatic_joint() -> None:
 
 
 def test_the_loops_are_tuned_for_a_body_and_for_none() -> None:
-    """The lift's two columns of the geometric mean are its own inertia and that with the body."""
+    """A lift meets one inertia in all postures: without the body, and with it."""
     body = Body(5.0, (0.1, 0.0, 0.0), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
     bare = _spec()
     tuned = replace(bare, tuned_with=body)
@@ -124,9 +124,6 @@ def test_the_loops_are_tuned_for_a_body_and_for_none() -> None:
     loaded = replace(bare, payload=body)
     with_body = tuned_inertia_a_s2(loaded, Plant(loaded))
     assert found[1] == pytest.approx(np.sqrt(without[1] * with_body[1]))
-    # Whatever is mounted when the power comes on, and the plant still carries it.
+    # Whatever is mounted at power-on.
     carrying = replace(tuned, payload=body)
-    loaded_plant = Plant(carrying)
-    assert tuned_inertia_a_s2(carrying, loaded_plant) == pytest.approx(found)
-    start = loaded_plant.motor_inertia_at(bare.start_rad)
-    assert start == pytest.approx(Plant(loaded).motor_inertia_at(bare.start_rad))
+    assert tuned_inertia_a_s2(carrying, Plant(carrying)) == pytest.approx(found)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident.discovery.joining import _contradiction
+from ident.discovery.candidates import ColumnCache
+from ident.discovery.evidence import with_effects
+from ident.discovery.gates import Gates
+from ident.discovery.joining import _contradiction, beside_others, linearised
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import NonlinearViscous
 from ident.effects.geometry_corrections import LatePosition
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
+from tests.ident.mistaken import small_recordings
+from tests.ident.recordings import gathered, three_axes_truth
 
 LATE = PlacedEffect(LatePosition(), 1)
 
@@ -57,3 +64,16 @@ def test_contradiction_never_refutes_what_instruments_find_at_half_the_size(
 ) -> None:
     placed = PlacedEffect(NonlinearViscous(0.5), 0)
     assert contradiction(sign * share * fitted, std, sign * fitted, placed) == ""
+
+
+@pytest.mark.parametrize(("delay_ms", "stays"), [(0.0, False), (0.1, False), (8.0, True)])
+def test_a_delay_that_explains_little_must_be_far_from_zero(delay_ms: float, stays: bool) -> None:
+    runs = []
+    for run in small_recordings(three_axes_truth(), 3, noise_a=0.03):
+        position = run.position_rad.copy()
+        position[:, 1] = np.interp(run.time_s - 1e-3 * delay_ms, run.time_s, position[:, 1])
+        runs.append(replace(run, position_rad=position))
+    fitted = with_effects(gathered(three_axes_truth(), tuple(runs)), (LATE,))
+    joint = linearised(fitted, ColumnCache())
+    _, why = beside_others(joint, fitted.effects[0], np.random.default_rng(0), Gates())
+    assert ("it explains little, and is less than 5 σ from zero" in why) is not stays

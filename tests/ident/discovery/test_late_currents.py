@@ -78,6 +78,16 @@ def test_delays_are_common_or_those_of_the_late_axes(
         assert seconds == pytest.approx(1e-3 * delays_ms[placed.axis], abs=6e-4)
 
 
+def test_one_current_that_is_left_to_test_is_no_common_delay() -> None:
+    """The model has a lag of the other two already: nothing says that they are late by the same time."""
+    evidence = _late(4.0, 4.0, 4.0)
+    problem = search_problem_of(evidence)
+    rates = torque_rates(evidence)
+    left = [one for one in try_delays(problem, rates) if one.axis == 2 or isinstance(one.members[0][0], TimeSkew)]
+    found = find_late_currents(problem, left, rates)
+    assert found is None or PlacedEffect(TimeSkew(), 0) not in found.effects
+
+
 @pytest.mark.parametrize("delay_ms", [8.0, -8.0])
 def test_a_long_delay_has_its_size_in_the_fit(delay_ms: float) -> None:
     """Without its filter, jumps of the torque shorten it."""
