@@ -340,7 +340,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
             with LiveGains(options.cell, payload_name, settings.target_percent, looks.show):
                 ended = calibrate(options.cell, declared, settings, person, tools, journal, block_signals=block_signals)
     except KeyboardInterrupt as interrupt:
-        axes = "; ".join(stop_notes(interrupt)) or "axes stopped"
+        axes = "; ".join(stop_notes(interrupt)) or "no axis moves"
         say_last(f"interrupted: {axes}; the same command goes on where the session is")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     if options.json:

@@ -58,7 +58,9 @@ def init(
     for path in make_cell_folder(folder, simulated=simulated):
         typer.echo(path)
     cell = folder / "cells" / f"{folder.resolve().name}.yaml"
-    if not simulated:
+    if simulated:
+        say("The cell is that of the demonstration: a six-axis arm on a simulated bus.", err=True)
+    else:
         say(f"Edit {cell} first: its numbers are an example's, and its comments say what replaces them.", err=True)
     say_next("drivegain", "scan", cell)
 

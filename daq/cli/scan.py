@@ -79,7 +79,7 @@ def scan_verb(
     if missing:
         raise no_answer(declared, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
     if not json and not mistyped and all(node.verdict == "ok" for node in listed):
-        say_next("drivegain", "plan", cell, "--out", "plan.yaml")
+        say_next("drivegain", "calibrate", cell, "--check")
 
 
 @dataclass(frozen=True, slots=True)

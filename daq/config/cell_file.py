@@ -18,7 +18,16 @@ from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, Effe
 from daq.config.checks import check
 from daq.config.drive import drive_from_text
 from daq.config.workspace import clearance_of
-from daq.config.yaml_file import Document, Fault, fault_texts, parse_yaml, read_model, read_yaml_bytes
+from daq.config.yaml_file import (
+    MAX_BYTES,
+    Document,
+    Fault,
+    fault_texts,
+    parse_yaml,
+    read_file,
+    read_model,
+    read_yaml_bytes,
+)
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing
 from drivers.profiles.profile import DriveProfile, Identity, TapPoint
@@ -42,7 +51,7 @@ def load_cell(path: Path | str) -> Cell:
     path = Path(path)
     sources = _sources(path)
     names = {name: str(source) for name, source in sources.items()}
-    return cell_from_bundle({name: read_yaml_bytes(source) for name, source in sources.items()}, path, names)
+    return cell_from_bundle(_read_sources(sources), path, names)
 
 
 def bundle(path: Path) -> dict[str, bytes]:
@@ -51,7 +60,7 @@ def bundle(path: Path) -> dict[str, bytes]:
     Raises:
         ConfigurationError: a file is missing, or the cell file is not what its schema says.
     """
-    return {name: read_yaml_bytes(source) for name, source in _sources(path).items()}
+    return _read_sources(_sources(path))
 
 
 def cell_from_bundle(
@@ -204,6 +213,27 @@ def _sources(path: Path) -> dict[str, Path]:
         if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
             sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
+
+
+def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
+    """Read the cell file and what it names.
+
+    Raises:
+        ConfigurationMissing: a file cannot be read. One that the cell file names is missing where the cell file alone
+            was copied, so the message says where the name is.
+    """
+    cell_file = sources[CELL]
+    content = {CELL: read_yaml_bytes(cell_file)}
+    for name, source in sources.items():
+        if name == CELL:
+            continue
+        content[name] = read_file(
+            source,
+            ConfigurationMissing,
+            expected=f"a file that {cell_file} names, of at most {MAX_BYTES} bytes",
+            remedy=f"copy it to this place, or correct its name in {cell_file.name}; names are relative to that file",
+        )
+    return content
 
 
 def _drive_path(folder: Path, drive: str) -> Path:

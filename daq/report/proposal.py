@@ -248,6 +248,7 @@ def show_file_rollback(written: Written, console: Console) -> None:
     replaced = "the file was gone" if backup is None else f"the replaced content is in {backup.name}"
     source = "" if edit.source is None else edit.source.name
     console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
+    console.print("Let the controller load the file.")
 
 
 def file_rollback_report(written: Written, audit: Path | None) -> FileRollback:

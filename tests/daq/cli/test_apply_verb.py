@@ -152,7 +152,9 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
     assert "these gains already" in capsys.readouterr().out
 
     assert main(undo) == ExitCode.OK
-    assert "Restored" in capsys.readouterr().out
+    restored = capsys.readouterr().out
+    assert "Restored" in restored
+    assert "Let the controller load the file." in restored
     assert bench.controller.read_bytes() == before
     there = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
     back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]

@@ -230,7 +230,7 @@ def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_seria
         monkeypatch.setattr(server, "_read", read)
         file.write_text(vendor_alone)
         assert main(["scan", str(file)]) == ExitCode.OK
-        assert "Next: drivegain plan" in capsys.readouterr().err
+        assert "Next: drivegain calibrate" in capsys.readouterr().err
         file.write_text(declared)
         # The scan has done its work: the exit code stays, and the text says that `record` will refuse.
         assert main(["scan", str(file)]) == ExitCode.OK

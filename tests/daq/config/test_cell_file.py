@@ -281,6 +281,17 @@ def test_a_missing_file_is_named(configurations: Path, old: str, new: str, messa
         load_cell(configurations / "nowhere.yaml")
 
 
+def test_a_cell_file_copied_without_its_robot_says_which_file_to_copy(configurations: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "elsewhere" / "kr270.yaml"
+    copied.parent.mkdir()
+    shutil.copyfile(configurations / "cells/kr270.yaml", copied)
+    with pytest.raises(ConfigurationMissing) as raised:
+        load_cell(copied)
+    assert "kr270.urdf" in raised.value.subject
+    assert "kr270.yaml names" in raised.value.expected
+    assert "copy it" in raised.value.remedy
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
