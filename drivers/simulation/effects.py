@@ -86,6 +86,53 @@ def spring(moment: Moment, axis: int, stiffness_nm_per_rad: float, rest_rad: flo
     moment.torque_nm[axis] -= stiffness_nm_per_rad * (moment.position_rad[axis] - rest_rad)
 
 
+def cable(
+    moment: Moment,
+    axis: int,
+    other_axis: float,
+    radius_m: float,
+    other_radius_m: float,
+    stiffness_n_per_m: float,
+    rest_m: float,
+) -> None:
+    """A stiff hose along two joints, led around each of them at a radius: it pulls where stretched, and pushes else.
+
+    Its way is r_i q_i + r_j q_j, and its force the stiffness times what the way is beyond `rest_m`. A negative radius
+    is the other side of a joint. `other_axis` is the number of the other joint, from 1 as a person counts.
+    """
+    _pull(moment, axis, other_axis, (radius_m, other_radius_m), stiffness_n_per_m, rest_m, -math.inf)
+
+
+def slack_cable(
+    moment: Moment,
+    axis: int,
+    other_axis: float,
+    radius_m: float,
+    other_radius_m: float,
+    stiffness_n_per_m: float,
+    rest_m: float,
+) -> None:
+    """A cable along two joints as `cable`, but one that only pulls: before `rest_m` it hangs slack."""
+    _pull(moment, axis, other_axis, (radius_m, other_radius_m), stiffness_n_per_m, rest_m, 0.0)
+
+
+def _pull(
+    moment: Moment,
+    axis: int,
+    other_axis: float,
+    radii_m: tuple[float, float],
+    stiffness_n_per_m: float,
+    rest_m: float,
+    least_m: float,
+) -> None:
+    """Take the force of what is stretched along two joints from both of them; the stretch is at least `least_m`."""
+    other = int(other_axis) - 1
+    way_m = radii_m[0] * moment.position_rad[axis] + radii_m[1] * moment.position_rad[other]
+    force_n = stiffness_n_per_m * max(least_m, way_m - rest_m)
+    moment.torque_nm[axis] -= radii_m[0] * force_n
+    moment.torque_nm[other] -= radii_m[1] * force_n
+
+
 def counterbalance(
     moment: Moment,
     axis: int,
@@ -124,6 +171,21 @@ def saturation(moment: Moment, axis: int, half_current_a: float) -> None:
     To first order the current that a torque needs is v = v₀ + v₀³/half_current², v₀ = τ/g.
     """
     moment.motor_torque_nm[axis] /= 1.0 + (moment.current_a[axis] / half_current_a) ** 2
+
+
+def clipped_current(moment: Moment, axis: int, limit_a: float) -> None:
+    """A drive that gives its motor less current than its reference asks for, without a word of it: ±limit at most."""
+    asked_a = abs(moment.current_a[axis])
+    if asked_a > limit_a:
+        moment.motor_torque_nm[axis] *= limit_a / asked_a
+
+
+def offset_drift(moment: Moment, axis: int, offset_nm: float, time_constant_s: float) -> None:
+    """An offset that goes away after power-on, offset·exp(−t/time_constant): a current sensor that warms up.
+
+    The motor gives so much less than its reference says, in joint units.
+    """
+    moment.motor_torque_nm[axis] -= offset_nm * math.exp(-moment.time_s / time_constant_s)
 
 
 def warm_up(moment: Moment, axis: int, cold_fraction: float, time_constant_s: float) -> None:
@@ -270,11 +332,15 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "nonlinear-viscous": nonlinear_viscous,
     "asymmetric-viscous": asymmetric_viscous,
     "spring": spring,
+    "cable": cable,
+    "slack-cable": slack_cable,
     "counterbalance": counterbalance,
     "position-friction": position_friction,
     "cogging": cogging,
     "saturation": saturation,
     "lag": Lag,
+    "clipped-current": clipped_current,
+    "offset-drift": offset_drift,
     "warm-up": warm_up,
     "temperature-friction": TemperatureFriction,
     "presliding": Presliding,
@@ -285,7 +351,19 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
 """Physics by its name in a simulation file; their arguments beside the moment and the axis are the parameters."""
 
 
-OF_MOTORS = ("cogging", "saturation", "lag", "temperature-friction", "backlash", "elasticity", "coupling")
+OF_MOTORS = (
+    "cogging",
+    "saturation",
+    "lag",
+    "clipped-current",
+    "offset-drift",
+    "temperature-friction",
+    "backlash",
+    "elasticity",
+    "coupling",
+    "cable",
+    "slack-cable",
+)
 """Effects that need a motor."""
 
 
@@ -321,9 +399,10 @@ def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] =
     wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
     if wrong:
         raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
+    other_axis = effect.parameters.get("other_axis")
+    if other_axis is not None and (other_axis not in range(1, axes + 1) or other_axis == joint + 1):
+        raise SpecInvalid(f"{effect.name}: other_axis {other_axis:g} is not another axis from 1 to {axes}")
     if not isinstance(physics, type):
         return partial(physics, axis=joint, **effect.parameters)
     built: WithState | Lag = physics(axis=joint, **effect.parameters)
-    if isinstance(built, Coupling) and (not 0 <= built.other < axes or built.other == built.axis):
-        raise SpecInvalid(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
     return built

@@ -12,6 +12,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.balancer import propose_balancers
+from ident.discovery.cables import propose_cables
 from ident.discovery.candidates import ColumnCache, SearchProblem
 from ident.discovery.choice import choice_covariance, is_small, scored_beside
 from ident.discovery.effect_verdict import EffectVerdict
@@ -484,7 +485,8 @@ def _proposals(
     resonances = propose_resonances(search_problem, gates, kinds)
     balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
     balancers = propose_balancers(search_problem, gates, families, balanced)
-    found = (ripples, resonances, balancers)
+    cables = propose_cables(search_problem, gates, families)
+    found = (ripples, resonances, balancers, cables)
     own = {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
     return propose_rotors(search_problem, gates, families, own)
 

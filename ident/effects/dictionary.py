@@ -32,6 +32,10 @@ FILTERS = (
 )
 """Time constants of a late current, and of an early one; those between are found by refinement."""
 
+FADING_S = (20.0, 40.0, 80.0, 160.0, 320.0, 900.0)  #: Time constants of what fades after power-on
+CABLE_DIRECTIONS_RAD = (np.pi / 4 * np.arange(-3, 4, 2)).tolist()
+"""Directions of a slack cable over two joints: both make as much of its way, in either sense."""
+
 EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(friction.Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
     tuple(friction.NonlinearViscous(exponent) for exponent in (1 / 3, 0.5, 2.0, 3.0)),
@@ -43,11 +47,10 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(electrical.Cogging(order) for order in ORDERS),
     (transmission.Ripple(0.5),),  # and what the periodogram proposes (ident.discovery.ripple)
     electrical.Saturation(two_terms=1).forms,
+    tuple(electrical.OffsetDrift(constant_s, whole) for constant_s in FADING_S for whole in (0, 1)),
     tuple(electrical.Lag(filter_s, backwards) for filter_s, backwards in FILTERS),
     tuple(electrical.TimeSkew(filter_s, backwards) for filter_s, backwards in FILTERS),
-    tuple(
-        friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
-    ),
+    tuple(friction.WarmUp(constant_s, whole) for constant_s in FADING_S for whole in (0, 1)),
     (friction.TemperatureFriction(),),
     (friction.PassiveFriction(),),
     tuple(friction.Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
@@ -57,6 +60,9 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(friction.Coupling(other, sense) for other in PAIRED for sense in (1, -1)),
     tuple(transmission.InertialCoupling(other) for other in PAIRED),
     tuple(position.Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
+    tuple(position.Cable(other) for other in PAIRED),
+    tuple(position.SlackCable(other, direction_rad) for other in PAIRED for direction_rad in CABLE_DIRECTIONS_RAD),
+    # and what fits the residual best (ident.discovery.cables)
     tuple(position.Compensator(order) for order in (1, 2)),
     tuple(
         position.Counterbalance(ratio, phase_rad)

@@ -190,7 +190,8 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
             raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
     for setting, allowed in _ranges(type(effect)).items():
         value = settings[setting]
-        if setting == "other_axis" and effect.abscissa is not Abscissa.OTHER_VELOCITY:
+        is_of_two = effect.side is GearSide.TWO_JOINTS or effect.abscissa is Abscissa.OTHER_VELOCITY
+        if setting == "other_axis" and not is_of_two:
             if value != 0:
                 raise EffectRefused(f"effect {name!r} is given other_axis = {value:g}; it has no other axis: 0")
         elif setting == "other_axis":

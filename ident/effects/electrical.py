@@ -1,7 +1,8 @@
-"""The motor and its current: a torque constant that drops at large current, torque ripple, and late currents."""
+"""The motor and its current: less torque at large current, torque ripple, offsets that drift, and late currents."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
 from ident.effects.effect import Effect, GearSide, Property, Range, Switch
-from ident.effects.signals import Abscissa, Signals
+from ident.effects.signals import Abscissa, Signals, watched_s
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
@@ -72,6 +73,36 @@ class Cogging(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
         return np.stack(cos_sin(self.order * signals.motor_position_rad[axis]))
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetDrift(Effect):
+    """τ = c · e^(−t/η), at the motor;  c > 0: the reference is too high by c/g at first, beside the declared offset.
+
+    Source: the offset of a current sensor drifts with its temperature, which settles with one time constant after
+    power-on. Signature: time, at any speed.
+    """
+
+    name = "offset-drift"
+    side = GearSide.MOTOR
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.TIME
+    coefficients = (Column("offset", "Nm"),)
+
+    time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η
+    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
+    whole_session: Switch
+
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
+        """Whether the offset settles while it is watched: over the session, or over the longest run."""
+        del axis
+        return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        del axis
+        time_s = signals.session_s if self.whole_session else signals.time_s
+        return np.asarray(np.exp(-time_s / self.time_constant_s))[None]
 
 
 @dataclass(frozen=True, slots=True)

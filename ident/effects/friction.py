@@ -12,7 +12,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
 from ident.effects.rotor import least_rotor_rest, loss_columns
-from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
+from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal, watched_s
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
@@ -229,10 +229,7 @@ class WarmUp(Effect):
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
         """Whether the friction fades while it is watched: over the session, or over the longest run."""
         del axis
-        if self.whole_session:
-            began_s, ended_s = (choose(run.session_s[end] for run in runs) for choose, end in ((min, 0), (max, -1)))
-            return bool(self.time_constant_s <= ended_s - began_s)
-        return bool(self.time_constant_s <= max(run.time_s[-1] for run in runs))
+        return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""

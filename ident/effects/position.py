@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import Effect, Property, Range, Sense, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -123,6 +123,7 @@ class Hinge(Effect):
     name = "hinge"
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
+    refined = ("start_rad",)
 
     start_rad: Annotated[float, Range(-1e3, 1e3)]  #: q₀
     sense: Sense  #: σ, 1 where it pulls above q₀, −1 below
@@ -137,3 +138,67 @@ class Hinge(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         return np.asarray(np.maximum(0.0, self.sense * (signals.position_rad[axis] - self.start_rad)))[None]
+
+
+@dataclass(frozen=True, slots=True)
+class Cable(Effect):
+    """τ_i = a q_i + b q_j and τ_j = b q_i + c q_j, with the torques at zero in the declared offsets;  a, c > 0.
+
+    Source: Hooke's law of a cable or hose that both joints stretch. One potential gives both torques,
+    V = ½ a q_i² + b q_i q_j + ½ c q_j², so b is the same in both. Led around the joints at radii r_i and r_j, it has
+    a = k r_i², b = k r_i r_j and c = k r_j². Signature: positions of two joints, at any speed.
+    """
+
+    name = "cable"
+    side = GearSide.TWO_JOINTS
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    coefficients = (
+        Column("stiffness", "Nm/rad", least=0.0),
+        Column("shared stiffness", "Nm/rad"),
+        Column("other stiffness", "Nm/rad", least=0.0),
+    )
+
+    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, 3, k)."""
+        own = signals.position_rad[axis]
+        other = signals.position_rad[self.other_axis - 1]
+        none = np.zeros_like(own)
+        on_own = np.stack((own, other, none))
+        on_other = np.stack((none, own, other))
+        return np.stack((on_own, on_other))
+
+
+@dataclass(frozen=True, slots=True)
+class SlackCable(Effect):
+    """τ_i = c h cos φ and τ_j = c h sin φ,  h = max(0, q_i cos φ + q_j sin φ − s₀);  c > 0: it pulls beyond s₀.
+
+    A cable along two joints that hangs slack before s₀: its potential is ½ c h². φ says how much of its way each joint
+    makes, tan φ = r_j/r_i with the radii at which it is led around them. Source: Hooke's law of a slack cable or hose.
+    Signature: positions of two joints, on one side.
+    """
+
+    name = "slack-cable"
+    side = GearSide.TWO_JOINTS
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    coefficients = (Column("stiffness", "Nm/rad", least=0.0),)
+    refined = ("direction_rad", "start_rad")
+
+    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
+    direction_rad: Annotated[float, Range(-10.0, 10.0)]  #: φ
+    start_rad: Annotated[float, Range(-1e3, 1e3)] = 0.0  #: s₀
+
+    def way(self, signals: Signals, axis: int) -> FloatArray:
+        """Way of the cable along both joints, per unit of its radius [rad], shape (k,)."""
+        cosine, sine = np.cos(self.direction_rad), np.sin(self.direction_rad)
+        return np.asarray(cosine * signals.position_rad[axis] + sine * signals.position_rad[self.other_axis - 1])
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, 1, k)."""
+        stretch = np.maximum(0.0, self.way(signals, axis) - self.start_rad)
+        on_own = np.cos(self.direction_rad) * stretch
+        on_other = np.sin(self.direction_rad) * stretch
+        return np.stack((on_own, on_other))[:, None]

@@ -276,6 +276,15 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
     return first_s if common else None
 
 
+def watched_s(runs: Sequence[Signals], *, whole_session: bool) -> float:
+    """How long an effect that fades in time was watched [s]: over the session, or over the longest run."""
+    if not whole_session:
+        return float(max(run.time_s[-1] for run in runs))
+    began_s = min(run.session_s[0] for run in runs)
+    ended_s = max(run.session_s[-1] for run in runs)
+    return float(ended_s - began_s)
+
+
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
     """Mass matrix of links and payload in some postures, shape (m, m, postures)."""
     samples = len(data.position_rad)

@@ -86,6 +86,43 @@ SINGLE_EFFECTS = (
 )
 """Each family on two axes."""
 
+def _cable(
+    name: str, joint: int, other: int, radii_m: tuple[float, float], stiffness_nm: float, rest: float
+) -> UndeclaredEffect:
+    """A cable around two joints; its stiffness at the first of them, and the way at rest in radians of that joint."""
+    return _effect(
+        name,
+        joint,
+        other_axis=float(other),
+        radius_m=radii_m[0],
+        other_radius_m=radii_m[1],
+        stiffness_n_per_m=stiffness_nm / radii_m[0] ** 2,
+        rest_m=rest * abs(radii_m[0]),
+    )
+
+
+FURTHER_EFFECTS = (
+    _cable("cable", 2, 3, (0.12, 0.08), 14.0, 0.3),
+    _cable("cable", 4, 5, (0.05, -0.05), 2.0, 0.0),
+    _cable("cable", 1, 2, (0.10, 0.15), 8.0, -0.2),
+    _cable("slack-cable", 2, 3, (0.10, 0.10), 25.0, 0.3),
+    _cable("slack-cable", 3, 4, (-0.06, 0.05), 8.0, -0.2),
+    _cable("slack-cable", 5, 6, (0.05, 0.04), 2.5, 0.2),
+    _effect("offset-drift", 1, offset_nm=3.0, time_constant_s=120.0),
+    _effect("offset-drift", 2, offset_nm=-6.0, time_constant_s=60.0),
+    _effect("offset-drift", 3, offset_nm=4.0, time_constant_s=240.0),
+    _effect("offset-drift", 4, offset_nm=1.0, time_constant_s=90.0),
+    _effect("offset-drift", 5, offset_nm=-1.0, time_constant_s=40.0),
+    _effect("offset-drift", 6, offset_nm=0.8, time_constant_s=150.0),
+    _effect("backlash", 1, gap_rad=0.004, stiffness_nm_per_rad=40000.0, damping_nm_s_per_rad=100.0),
+    _effect("backlash", 1, gap_rad=0.006, stiffness_nm_per_rad=20000.0, damping_nm_s_per_rad=60.0),
+    _effect("backlash", 4, gap_rad=0.008, stiffness_nm_per_rad=3000.0, damping_nm_s_per_rad=4.0),
+    _effect("backlash", 4, gap_rad=0.012, stiffness_nm_per_rad=2000.0, damping_nm_s_per_rad=3.0),
+    _effect("backlash", 6, gap_rad=0.012, stiffness_nm_per_rad=1000.0, damping_nm_s_per_rad=1.0),
+    _effect("backlash", 6, gap_rad=0.02, stiffness_nm_per_rad=800.0, damping_nm_s_per_rad=1.0),
+)
+"""Cables over two joints, offsets that drift, and free play where no weight holds the flanks together."""
+
 _SIZES = frozenset(
     {
         "rise_nm",
@@ -121,6 +158,10 @@ def _smaller(effect: UndeclaredEffect) -> UndeclaredEffect:
 SINGLES = tuple(
     EffectCase(f"single-{number:02d}-{effect.name}-J{effect.axis + 1}", 2001 + number, (effect,))
     for number, effect in enumerate(chain.from_iterable(SINGLE_EFFECTS))
+)
+FURTHER = tuple(
+    EffectCase(f"further-{number:02d}-{effect.name}-J{effect.axis + 1}", 2301 + number, (effect,))
+    for number, effect in enumerate(FURTHER_EFFECTS)
 )
 CLEAN = tuple(EffectCase(f"clean-{number:02d}", 2001 + number, ()) for number in range(28))
 """The same cells without their effect: the clean floor of each seed, and the count of false effects."""

@@ -36,7 +36,7 @@ from ident.effects.effect import GearSide, PlacedEffect
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
-from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
+from tests.studies.effect_cells import APART, CLEAN, FURTHER, SINGLES, SMALLS, TOGETHER, EffectCase
 from tests.studies.effect_runs import DURATION_S, CaseTask, fingerprint_of_runs, load_runs, make_case
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.output import as_csv
@@ -82,6 +82,7 @@ PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
     ("small", SMALLS),
     ("apart", APART),
     ("together", TOGETHER),
+    ("further", FURTHER),
     ("removed", REMOVED),
     ("imported", IMPORTED),
 )
@@ -368,6 +369,11 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         if both:
             hit = sum(set(row.true) <= set(row.named) for row in both)
             lines.append(f"two effects {part}: both named in {hit} of {len(both)}")
+    further = [row for row in rows if row.part == "further"]
+    if further:
+        named = sum(row.named[:1] == row.true for row in further)
+        small = sum(row.max_gain_error_percent <= GAIN_PERCENT for row in further)
+        lines.append(f"cables, drifts and play: {named} of {len(further)} named first, gains {small} within the limit")
     imported = [row for row in rows if row.part == "imported"]
     if imported:
         named = sum(set(row.true) <= set(row.named) for row in imported)

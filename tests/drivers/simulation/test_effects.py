@@ -120,6 +120,36 @@ def test_spring_depends_on_position_alone() -> None:
         np.testing.assert_allclose(extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["cable", "slack-cable"])
+@pytest.mark.parametrize("rest_m", [-0.02, 0.2])
+def test_a_cable_pulls_both_joints_that_it_is_led_around(name: str, rest_m: float) -> None:
+    """Its torques are the slopes of one energy, ½ k stretch²."""
+    parameters = {"other_axis": 4.0, "radius_m": 0.1, "other_radius_m": -0.05}
+    effect = UndeclaredEffect(name, 2, {**parameters, "stiffness_n_per_m": 2500.0, "rest_m": rest_m})
+
+    def energy(turned: FloatArray) -> float:
+        stretch_m = float(0.1 * turned[2] - 0.05 * turned[3]) - rest_m
+        return 0.0 if name == "slack-cable" and stretch_m < 0.0 else 1250.0 * stretch_m**2
+
+    slopes = [energy(POSTURE + only(joint, 1e-5)) - energy(POSTURE - only(joint, 1e-5)) for joint in range(6)]
+    np.testing.assert_allclose(extra_torque_nm(effect), -np.array(slopes) / 2e-5, atol=1e-5)
+
+
+def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
+    effect = UndeclaredEffect("clipped-current", 0, {"limit_a": 2.0})
+    gain = clean_cell().axes[0].gain_nm_per_a
+    for current in (-5.0, -1.0, 2.0, 3.0):
+        given_a = min(max(current, -2.0), 2.0)
+        lost = gain * (current - given_a)
+        np.testing.assert_allclose(extra_torque_nm(effect, current=only(0, current)), only(0, -lost), atol=1e-6)
+
+
+def test_an_offset_that_drifts_fades_with_time() -> None:
+    effect = UndeclaredEffect("offset-drift", 1, {"offset_nm": 3.0, "time_constant_s": 50.0})
+    np.testing.assert_allclose(extra_torque_nm(effect), only(1, -3.0), atol=1e-6)
+    np.testing.assert_allclose(extra_torque_nm(effect, time_s=100.0), only(1, -3.0 * math.exp(-2.0)), atol=1e-6)
+
+
 @given(angle=st.floats(-3.0, 3.0))
 @settings(max_examples=10)
 def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
@@ -312,9 +342,12 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
         build_effect(UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6)
     with pytest.raises(SpecInvalid, match="other_axis"):
         build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
+    cable = {"other_axis": 7, "radius_m": 0.1, "other_radius_m": 0.1, "stiffness_n_per_m": 1.0, "rest_m": 0.0}
+    with pytest.raises(SpecInvalid, match="other_axis"):
+        build_effect(UndeclaredEffect("cable", 3, cable), 6)
     with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
         build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
-    assert len(UNDECLARED_EFFECTS) == 17
+    assert len(UNDECLARED_EFFECTS) == 21
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:

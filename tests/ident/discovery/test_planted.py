@@ -156,6 +156,22 @@ def _inertial(t: TrueSignals, other: int) -> FloatArray:
     return torque
 
 
+def _hose(t: TrueSignals, other: int) -> FloatArray:
+    """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which pulls and pushes."""
+    force = 30.0 * (0.8 * t.positions[t.axis] - 0.6 * t.positions[other])
+    torque = np.zeros_like(t.positions)
+    torque[t.axis], torque[other] = 0.8 * force, -0.6 * force
+    return torque
+
+
+def _slack_cable(t: TrueSignals, other: int) -> FloatArray:
+    """A cable that pulls where the joint is before the other one, around both at one radius; half of it on each."""
+    force = np.where(t.positions[t.axis] > t.positions[other], t.positions[t.axis] - t.positions[other], 0.0)
+    torque = np.zeros_like(t.positions)
+    torque[t.axis], torque[other] = 15.0 * force, -15.0 * force
+    return torque
+
+
 def _lengthening(angle: FloatArray, foot_m: float, lever_m: float, force_n: float) -> FloatArray:
     """A constant force along a balancer: its work F Δs between neighbouring angles, over their difference."""
     ends = [np.array([np.cos(angle + way), np.sin(angle + way)]) * lever_m for way in (-1e-6, 1e-6)]
@@ -220,6 +236,9 @@ SMALL_CASES = (
     Planted("coupling", 1, lambda t: _rubbing(t, 2), (2.0, 0.8)),
     Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
     Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),
+    Planted("cable", 1, lambda t: _hose(t, 2), (19.2, -14.4, 10.8)),
+    Planted("slack-cable", 1, lambda t: _slack_cable(t, 2), (30.0,)),
+    Planted("offset-drift", 1, lambda t: 4.0 * np.exp(-(t.started_s + t.time_s) / 60.0), (4.0,)),
     Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),
     Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0,)),
 )  # fmt: skip

@@ -1,0 +1,102 @@
+"""Propose where a cable along two joints begins to pull, and how much of its way each joint makes.
+
+Both are settings on which the torque depends strongly, and a grid of them on every pair of joints would be most of all
+candidates. So they are tried on the pair alone whose residual a cable of the dictionary explains most of, and the best
+of them are fitted beside the model. They compete together with all that were tried, which represent the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
+from ident.discovery.gates import Gates
+from ident.discovery.refinement import is_strictly_possible, refine_together
+from ident.effects.effect import Effect, is_placeable
+from ident.effects.position import Cable, SlackCable
+
+DIRECTIONS = 12  #: Of the way of a cable, tried on a pair of joints
+SHARES_OF_WAY = (0.1, 0.3, 0.5, 0.7)  #: Of the rows in which a cable is still slack, where it begins to pull
+STARTS = 3  #: From which direction and start are fitted
+LEAST_SLACK = 0.05  #: Share of the rows in which a slack cable hangs slack: one that never does is a `Cable`
+ONE_JOINT_RAD = 0.15  #: Of a direction from a joint's own, below which a cable is a `Hinge` of that joint
+
+Tried = tuple[Effect, CandidateTrial]
+
+
+def propose_cables(
+    search_problem: SearchProblem, gates: Gates, families: tuple[tuple[Effect, ...], ...]
+) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
+    """Return a family of slack cables for the pair of joints that a cable explains most of, by its lower axis.
+
+    Args:
+        search_problem: around the model.
+        gates: what a cable explains of a motor's squared residual must reach their least share.
+        families: the dictionary; without cables in it nothing is proposed.
+    """
+    cables = tuple(family for family in families if isinstance(family[0], Cable | SlackCable))
+    grid = next((family for family in cables if isinstance(family[0], SlackCable)), ())
+    if not grid:
+        return {}
+    found: list[tuple[float, int, Effect]] = []
+    for axis in range(search_problem.axes):
+        tested = search_problem.test(cables, axis, at_rows=True)
+        tried = [member for family in tested for member in family.members]
+        shares = shares_explained(search_problem, [trial for _, trial in tried])
+        found += [(share, axis, effect) for share, (effect, _) in zip(shares, tried, strict=True)]
+    if not found:
+        return {}
+    share, axis, best = max(found, key=lambda one: one[0])
+    if share < gates.smallest_share:
+        return {}
+    other_axis = int(best.settings["other_axis"])
+    tried = _tried(search_problem, axis, other_axis)
+    refined: list[Effect] = []
+    for effect in _best_of(search_problem, tried):
+        fitted = refine_together(search_problem, effect, axis)
+        if isinstance(fitted, SlackCable) and _is_slack_cable(search_problem, fitted, axis):
+            refined.append(fitted)
+    shared = tuple(effect for effect in grid if is_placeable(effect, axis, search_problem.model.robot))
+    return {axis: ((*shared, *(effect for effect, _ in tried), *refined),)}
+
+
+def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tried]:
+    """Slack cables on a pair of joints that the model does not contain, with their trials."""
+    effects: list[SlackCable] = []
+    step_rad = 2.0 * np.pi / DIRECTIONS
+    for direction_rad in (step_rad * (np.arange(DIRECTIONS) + 0.5) - np.pi).tolist():  # none along one joint alone
+        cable = SlackCable(other_axis, direction_rad)
+        starts_rad = np.quantile(_way(search_problem, cable, axis), SHARES_OF_WAY)
+        effects += [SlackCable(other_axis, direction_rad, float(f"{start_rad:.4g}")) for start_rad in starts_rad]
+    tested = search_problem.test((tuple(effects),), axis, at_rows=True)
+    return [member for family in tested for member in family.members]
+
+
+def _way(search_problem: SearchProblem, cable: SlackCable, axis: int) -> FloatArray:
+    """Way of a cable on the rows of the fit [rad], shape (r,)."""
+    return np.concatenate([cable.way(run, axis) for run in search_problem.rows])
+
+
+def _is_slack_cable(search_problem: SearchProblem, cable: SlackCable, axis: int) -> bool:
+    """Whether a cable hangs slack in a part of the rows, and both joints make a part of its way."""
+    is_slack = _way(search_problem, cable, axis) < cable.start_rad
+    quarter_turns = cable.direction_rad / (np.pi / 2.0)
+    from_one_joint_rad = abs(quarter_turns - round(quarter_turns)) * np.pi / 2.0
+    return bool(np.mean(is_slack) >= LEAST_SLACK and from_one_joint_rad >= ONE_JOINT_RAD)
+
+
+def _best_of(search_problem: SearchProblem, tried: Sequence[Tried]) -> tuple[Effect, ...]:
+    """The best possible cable of each of the best directions: the simplex does not find the way between them."""
+    shares = shares_explained(search_problem, [trial for _, trial in tried])
+    possible = [
+        (share, effect)
+        for share, (effect, trial) in zip(shares, tried, strict=True)
+        if is_strictly_possible(effect, trial)
+    ]
+    best: dict[float, Effect] = {}
+    for _, effect in sorted(possible, key=lambda one: -one[0]):
+        best.setdefault(effect.settings["direction_rad"], effect)
+    return tuple(best.values())[:STARTS]
