@@ -10,6 +10,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
 from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
+from ident.data.held import HeldChannels, fill_held
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
@@ -50,6 +51,7 @@ class Dataset:
     #: Samples whose current was clipped by a limit that the drive does not report; they are not valid. None where
     #: clipping was not looked for.
     clipped: BoolArray | None = None
+    held: HeldChannels | None = None  #: channels whose held readings were filled in; None where none was held
     is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 
     def motion(self, part: slice = slice(None)) -> Motion:
@@ -83,13 +85,15 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     run = replace(run, time_s=time_s)
     _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
+    recorded_current = current
+    position, current, held = fill_held(position, current, rate)
     raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
     position, velocity, acceleration = central_differences(smooth, rate)
     speed = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))
     moving, motor_moving = moving_samples(velocity, speed, drive_train)
     valid = np.ones_like(moving).T if usable is None else np.array(usable[1:-1], dtype=np.bool_, order="F")
-    clipped = clipped_samples(current[1:-1], valid & motor_moving.T)
+    clipped = clipped_samples(recorded_current[1:-1], valid & motor_moving.T)
     valid &= ~clipped
     # If the log has no moves, a new one begins after every standstill of all joints.
     any_moving = np.any(moving, axis=0)
@@ -114,6 +118,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         started_s=run.started_s,
         temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
         clipped=clipped,
+        held=held,
     )
 
 

@@ -1,4 +1,4 @@
-"""Faults of single channels of a run: a joint that never moves, a current that is constant or clipped.
+"""Faults of single channels of a run: a joint that never moves, a current that is constant or clipped, held readings.
 
 Each is plain in the channel itself. In the equations of a fit it looks like something else, such as a payload that was
 not mounted, so it is named from the channels before a cause is looked for there.
@@ -14,6 +14,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.data.dataset import Dataset
+from ident.data.held import HeldChannels
 from ident.errors import CurrentConstant, Diagnosis, JointStill
 from ident.model.robot import JointKind
 
@@ -37,6 +38,7 @@ class RunChannels:
     constant_current: BoolArray  #: motors that move with a current of one value, shape (m,)
     #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
     clipped_percent: FloatArray
+    held: HeldChannels | None  #: readings that were held; None where none was
     limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
 
 
@@ -60,7 +62,7 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
         own = data.current_a[usable[:, motor], motor]
         is_constant[motor] = len(own) >= LEAST_SAMPLES and not still[motor] and np.ptp(own) == 0.0
     mounting = None if data.payload is None else data.payload.mounting
-    return RunChannels(data.name, mounting, still, moved, is_constant, percent, limits)
+    return RunChannels(data.name, mounting, still, moved, is_constant, percent, data.held, limits)
 
 
 def require_live_currents(run: RunChannels, axes: Sequence[str]) -> None:
@@ -91,6 +93,34 @@ def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
         "a current that follows the torque at every moment",
         "record slower moves or with a lighter payload, or raise the limit of the current in the drive or in what "
         "recorded it",
+    )
+
+
+def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
+    """Name channels whose readings were held; what was held was filled in."""
+    for run in runs:
+        if run.held is None:
+            continue
+        for what, share, hold_s in (
+            ("positions", run.held.position_share, run.held.position_hold_s),
+            ("currents", run.held.current_share, run.held.current_hold_s),
+        ):
+            held = np.flatnonzero(share).tolist()
+            if held:
+                names = tuple(axes[axis] for axis in held)
+                yield _held_diagnosis(run.run, what, names, float(share[held].max()), float(np.median(hold_s[held])))
+
+
+def _held_diagnosis(run: str, what: str, axes: tuple[str, ...], share: float, hold_s: float) -> Diagnosis:
+    return Diagnosis(
+        "readings-held",
+        (run,),
+        axes,
+        f"{what} that repeat the reading before while the robot moves, in up to {100.0 * share:.0f} % of the samples, "
+        f"for some {1e3 * hold_s:.3g} ms; what lies between two new readings was filled in",
+        "a new reading in every sample",
+        "record at the rate at which the controller answers, or let it answer at the rate of the recording; noise of a "
+        "current between the readings is lost, and makes the error larger",
     )
 
 

@@ -1,0 +1,131 @@
+"""Readings that are held: a recorder that samples faster than the controller answers stores the same number again.
+
+A held position is a staircase, and its derivatives are blows that no filter takes out again. Held samples are treated
+as missing: the position between two new readings is that of a cubic spline through them, the current that of a
+straight line. A reading is as old as its first sample says.
+
+Repeated numbers alone show nothing: a joint at rest repeats its position, and a coarse encoder repeats each count until
+the next one comes. But where a reading stays for a while and then jumps by several counts, the counts between were not
+read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # loads scipy.interpolate when it is first used: most fits need none of it
+
+from ident.arrays import BoolArray, FloatArray
+
+LEAST_HELD = 0.1
+"""Least share of the readings of a channel in motion that are held before it is treated. A noisy current repeats up to
+a twentieth of its readings by chance, and so do positions of a controller whose cycles are not even."""
+JUMP_COUNTS = 3.0  #: Smallest jump after a held reading, in counts of the channel
+ROUNDING = 1e-9  #: Of a channel's range: smaller changes are rounding, no counts
+LONGEST_HOLD_S = 0.05  #: A reading that stays longer may be a joint at rest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldChannels:
+    """Shares of the readings in motion that were held, and how long a reading stays; 0 for channels left as they are."""
+
+    position_share: FloatArray  #: of each joint, shape (n,)
+    position_hold_s: FloatArray  #: median, shape (n,)
+    current_share: FloatArray  #: of each motor, shape (n,)
+    current_hold_s: FloatArray  #: median, shape (n,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One channel of a run without its held samples."""
+
+    values: FloatArray  #: with what was held filled in, shape (k,)
+    share: float = 0.0  #: of the readings in motion that were held; 0 where the channel was left as it is
+    hold_s: float = 0.0  #: how long a reading stays, median; 0 where the channel was left as it is
+
+
+def fill_held(
+    position: FloatArray, current: FloatArray, rate_hz: float
+) -> tuple[FloatArray, FloatArray, HeldChannels | None]:
+    """Fill in the held samples of a run's channels.
+
+    Args:
+        position: of the joints, shape (k, n).
+        current: of the motors, shape (k, n).
+        rate_hz: sampling rate.
+
+    Returns:
+        position and current, the same arrays where no channel holds its readings, and what was held, or None.
+    """
+    positions = [without_held(channel, rate_hz, smooth=True) for channel in position.T]
+    currents = [without_held(channel, rate_hz, smooth=False) for channel in current.T]
+    if not any(channel.share for channel in (*positions, *currents)):
+        return position, current, None
+    held = HeldChannels(
+        position_share=np.array([channel.share for channel in positions]),
+        position_hold_s=np.array([channel.hold_s for channel in positions]),
+        current_share=np.array([channel.share for channel in currents]),
+        current_hold_s=np.array([channel.hold_s for channel in currents]),
+    )
+    filled_position = np.stack([channel.values for channel in positions], axis=1)
+    filled_current = np.stack([channel.values for channel in currents], axis=1)
+    return filled_position, filled_current, held
+
+
+def without_held(values: FloatArray, rate_hz: float, *, smooth: bool) -> Channel:
+    """Fill in the held samples of a channel; it stays as it is where fewer than LEAST_HELD are held.
+
+    Args:
+        values: of the channel, shape (k,).
+        rate_hz: sampling rate.
+        smooth: by a cubic spline, else by straight lines.
+    """
+    held = held_samples(values, rate_hz)
+    share = _share_held(values, held)
+    if share < LEAST_HELD:
+        return Channel(values)
+    sample = np.arange(len(values))
+    read = ~held
+    if smooth:
+        filled = scipy.interpolate.CubicSpline(sample[read], values[read])(sample[held])
+    else:
+        filled = np.interp(sample[held], sample[read], values[read])
+    out = values.copy()
+    out[held] = filled
+    lengths = np.diff(np.flatnonzero(read))
+    hold_s = float(np.median(lengths[lengths > 1])) / rate_hz
+    return Channel(out, share, hold_s)
+
+
+def held_samples(values: FloatArray, rate_hz: float) -> BoolArray:
+    """Return which samples repeat a reading that then jumps, shape (k,); its first sample is not one of them.
+
+    Args:
+        values: of a channel, shape (k,).
+        rate_hz: sampling rate.
+    """
+    held = np.zeros(len(values), dtype=np.bool_)
+    first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)  # of each reading
+    lengths = np.diff(first)
+    if not len(lengths) or lengths.max() == 1:
+        return held
+    jumps = np.abs(np.diff(values[first]))
+    is_held = (lengths > 1) & (lengths <= LONGEST_HOLD_S * rate_hz) & (jumps > JUMP_COUNTS * _count(values, jumps))
+    held[: first[-1]] = np.repeat(is_held, lengths)
+    held[first] = False
+    return held
+
+
+def _count(values: FloatArray, jumps: FloatArray) -> float:
+    """Size of a count of a channel: its smallest change; 0 for a channel without counts."""
+    least = ROUNDING * float(np.ptp(values))
+    counts = jumps[jumps > least]
+    return float(counts.min()) if len(counts) else 0.0
+
+
+def _share_held(values: FloatArray, held: BoolArray) -> float:
+    """Share of the samples in which a channel changes, or should, that are held."""
+    changes = np.count_nonzero(np.diff(values))
+    count = np.count_nonzero(held)
+    return count / max(count + changes, 1)
