@@ -118,8 +118,8 @@ FURTHER_EFFECTS = (
     _effect("backlash", 1, gap_rad=0.006, stiffness_nm_per_rad=20000.0, damping_nm_s_per_rad=60.0),
     _effect("backlash", 4, gap_rad=0.008, stiffness_nm_per_rad=3000.0, damping_nm_s_per_rad=4.0),
     _effect("backlash", 4, gap_rad=0.012, stiffness_nm_per_rad=2000.0, damping_nm_s_per_rad=3.0),
-    _effect("backlash", 6, gap_rad=0.012, stiffness_nm_per_rad=1000.0, damping_nm_s_per_rad=1.0),
-    _effect("backlash", 6, gap_rad=0.02, stiffness_nm_per_rad=800.0, damping_nm_s_per_rad=1.0),
+    _effect("backlash", 5, gap_rad=0.008, stiffness_nm_per_rad=2500.0, damping_nm_s_per_rad=3.0),
+    _effect("backlash", 5, gap_rad=0.014, stiffness_nm_per_rad=1500.0, damping_nm_s_per_rad=2.0),
 )
 """Cables over two joints, offsets that drift, and free play where no weight holds the flanks together."""
 
