@@ -28,7 +28,7 @@ LONGEST_HOLD_S = 0.05  #: A reading that stays longer may be a joint at rest
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldChannels:
-    """Shares of the readings in motion that were held, and how long a reading stays; 0 for channels left as they are."""
+    """Share of the readings in motion that were held, and how long a reading stays; 0 for channels left as they are."""
 
     position_share: FloatArray  #: of each joint, shape (n,)
     position_hold_s: FloatArray  #: median, shape (n,)
@@ -126,6 +126,6 @@ def _count(values: FloatArray, jumps: FloatArray) -> float:
 
 def _share_held(values: FloatArray, held: BoolArray) -> float:
     """Share of the samples in which a channel changes, or should, that are held."""
-    changes = np.count_nonzero(np.diff(values))
-    count = np.count_nonzero(held)
+    changes = int(np.count_nonzero(np.diff(values)))
+    count = int(np.count_nonzero(held))
     return count / max(count + changes, 1)

@@ -86,6 +86,7 @@ SINGLE_EFFECTS = (
 )
 """Each family on two axes."""
 
+
 def _cable(
     name: str, joint: int, other: int, radii_m: tuple[float, float], stiffness_nm: float, rest: float
 ) -> UndeclaredEffect:

@@ -371,9 +371,12 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
             lines.append(f"two effects {part}: both named in {hit} of {len(both)}")
     further = [row for row in rows if row.part == "further"]
     if further:
-        named = sum(row.named[:1] == row.true for row in further)
-        small = sum(row.max_gain_error_percent <= GAIN_PERCENT for row in further)
-        lines.append(f"cables, drifts and play: {named} of {len(further)} named first, gains {small} within the limit")
+        first = [row for row in further if row.named[:1] == row.true]
+        small = [row for row in further if row.max_gain_error_percent <= GAIN_PERCENT]
+        lines.append(
+            f"cables, drifts and play: {len(first)} of {len(further)} named first, gains of {len(small)} within "
+            f"{GAIN_PERCENT} %"
+        )
     imported = [row for row in rows if row.part == "imported"]
     if imported:
         named = sum(set(row.true) <= set(row.named) for row in imported)

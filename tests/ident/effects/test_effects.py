@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.discovery.structure import VARIABLES
-from ident.effects.dictionary import EFFECTS, PAIRED, GEOMETRY
+from ident.effects.dictionary import EFFECTS, GEOMETRY, PAIRED
 from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
