@@ -39,7 +39,7 @@ def propose_cables(
     """
     cables = tuple(family for family in families if isinstance(family[0], Cable | SlackCable))
     grid = next((family for family in cables if isinstance(family[0], SlackCable)), ())
-    if not grid:
+    if not grid or search_problem.folds.moves < grid[0].least_moves:
         return {}
     found: list[tuple[float, int, Effect]] = []
     for axis in range(search_problem.axes):

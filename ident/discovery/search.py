@@ -38,10 +38,13 @@ from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
+from ident.effects.position import Cable, Compensator, Counterbalance, Hinge, SlackCable, Spring
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
+CABLE_MORE = 0.15
+"""Share by which a cable over two joints must explain more than a spring, a hinge or a compensator of one of them."""
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
 GOLDEN_STEPS = 6  #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
@@ -103,13 +106,20 @@ def rank_effects(
         own = (proposed or {}).get(axis, ())
         names = {family[0].name for family in own}
         shared = (family for family in families if family[0].name not in names)
-        placeable = (
-            tuple(one for one in family if is_placeable(one, axis, search_problem.model.robot))
-            for family in (*shared, *own)
-        )
-        fitting = (tuple(one for one in family if one.fits_in(search_problem.runs, axis)) for family in placeable)
-        tested += search_problem.test((family for family in fitting if family), axis)
+        fitting: list[tuple[Effect, ...]] = []
+        for family in (*shared, *own):
+            members = tuple(one for one in family if _is_tried(search_problem, one, axis))
+            if members:
+                fitting.append(members)
+        tested += search_problem.test(fitting, axis)
     return rank_families(search_problem, tested, rng, gates or Gates(), known)
+
+
+def _is_tried(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
+    """Whether an effect can be on an axis, and these data can show it there."""
+    if not is_placeable(effect, axis, search_problem.model.robot):
+        return False
+    return effect.least_moves <= search_problem.folds.moves and effect.fits_in(search_problem.runs, axis)
 
 
 def rank_families(
@@ -168,12 +178,15 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
 
     So a hinge that starts outside the joint's range is reported as a spring. Beside an effect whose settings are fitted
     to the residual, nearly as good is not enough: folds must not distinguish them, or a balancer would be a spring with
-    harmonics. Places that are taken, in the model or refused, are not chosen again.
+    harmonics. A cable over two joints has many settings, so it must explain clearly more than what one joint does.
+    Places that are taken, in the model or refused, are not chosen again.
     """
     passed = [found for found in findings if found.passed and effect_key(found.effect, found.axis) not in taken]
     if not passed:
         return None
     best = passed[0]
+    if isinstance(best.effect, Cable | SlackCable):
+        best = next((found for found in passed if _is_simpler_than_cable(found, best)), best)
     alike = [
         finding
         for finding in passed
@@ -182,6 +195,14 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
         and not (best.effect.refined and is_better(best.fold_errors, finding.fold_errors))
     ]
     return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(_own_settings(finding.effect)))
+
+
+def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
+    """Whether an effect of the position of one joint of a cable's pair explains nearly as much as the cable."""
+    if not isinstance(found.effect, Spring | Hinge | Compensator | Counterbalance):
+        return False
+    pair = (cable.axis, int(cable.effect.settings["other_axis"]) - 1)
+    return found.axis in pair and cable.held_out_fall < (1.0 + CABLE_MORE) * found.held_out_fall
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:

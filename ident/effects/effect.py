@@ -138,6 +138,16 @@ class Effect(ABC):
         return self.side is GearSide.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
 
     @property
+    def reach(self) -> int | None:
+        """How many joints further along the robot the other joint of a pair may be; None for any."""
+        return None
+
+    @property
+    def least_moves(self) -> int:
+        """Fewest moves of the data among which a search tries it."""
+        return 0
+
+    @property
     def forms(self) -> tuple[Self, ...]:
         """Simpler forms of the effect, then the effect itself; each form's columns are the first ones of the next."""
         return (self,)
@@ -318,4 +328,12 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
         return False
     if not effect.has_axis:
         return axis == 0
-    return effect.side is not GearSide.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.axis_count
+    return effect.side is not GearSide.TWO_JOINTS or _is_pair(effect, axis, robot)
+
+
+def _is_pair(effect: Effect, axis: int, robot: Robot) -> bool:
+    """Whether the other axis of an effect of two joints comes behind this one, within its reach."""
+    other_axis = int(effect.settings["other_axis"])
+    if effect.reach is not None and other_axis > axis + 1 + effect.reach:
+        return False
+    return axis + 1 < other_axis <= robot.axis_count

@@ -13,6 +13,13 @@ from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
+CABLE_REACH = 2
+"""A cable or hose is led along neighbouring joints; between joints far apart, others would stretch it as well."""
+
+CABLE_MOVES = 35
+"""As many as a term without a name needs: a cable's settings are chosen from as many shapes. In ten moves of a real
+arm, one joined that raised the error where the arm had not been."""
+
 
 @dataclass(frozen=True, slots=True)
 class Spring(Effect):
@@ -151,6 +158,8 @@ class Cable(Effect):
 
     name = "cable"
     side = GearSide.TWO_JOINTS
+    reach = CABLE_REACH
+    least_moves = CABLE_MOVES
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
     coefficients = (
@@ -182,6 +191,8 @@ class SlackCable(Effect):
 
     name = "slack-cable"
     side = GearSide.TWO_JOINTS
+    reach = CABLE_REACH
+    least_moves = CABLE_MOVES
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
     coefficients = (Column("stiffness", "Nm/rad", least=0.0),)

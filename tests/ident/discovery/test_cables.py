@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,10 +13,11 @@ from ident.discovery.cables import propose_cables
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
+from ident.discovery.search import rank_effects
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import PlacedEffect, is_placeable
 from ident.effects.position import Cable, Compensator, Hinge, SlackCable, Spring
-from tests.ident.recordings import Truth, bent, search_problem_of
+from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, three_axes_truth
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
@@ -88,3 +91,24 @@ def test_a_hinge_of_one_joint_stays_one(small: Evidence, small_truth: Truth) -> 
 def test_nothing_is_proposed_where_no_cable_is(small: Evidence) -> None:
     assert propose_cables(search_problem_of(small), GATES, EFFECTS) == {}
     assert _found(small)[0] == ()
+
+
+def test_no_cable_is_tried_in_few_moves(small_truth: Truth) -> None:
+    """A shape with many settings fits the few moves."""
+    rng = np.random.default_rng(4)
+    runs = tuple(
+        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, seconds=8.0) for index in range(4)
+    )
+    start = _cabled(gathered(small_truth, runs), small_truth, radii=RADII, start_rad=0.3)
+    problem = search_problem_of(start)
+    assert problem.folds.moves < SlackCable(3, 0.5).least_moves
+    assert propose_cables(problem, GATES, OF_POSITION) == {}
+    names = {finding.effect.name for finding in rank_effects(problem, np.random.default_rng(0), GATES, OF_POSITION)}
+    assert names == {"spring", "hinge", "gravity-compensator"}
+
+
+def test_a_cable_is_led_along_neighbouring_joints() -> None:
+    robot = three_axes_truth().model.robot
+    six = replace(robot, joints=robot.joints * 2)
+    reached = [other for other in range(2, 7) if is_placeable(Cable(other), 0, six)]
+    assert reached == [2, 3]
