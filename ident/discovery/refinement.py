@@ -30,14 +30,14 @@ def is_strictly_possible(effect: Effect, trial: CandidateTrial) -> bool:
 
 
 def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
-    """Refine the settings that an effect names in `Effect.refined`, or return it unchanged where none is better.
+    """Refine the settings in `Effect.refined_once_chosen`, or return the effect unchanged where none is better.
 
     Args:
         search_problem: around the model without the effect.
         effect: where to begin.
         axis: index of its joint.
     """
-    names = effect.refined
+    names = effect.refined_once_chosen
     ranges = [setting_range(effect, name) for name in names]
 
     def changed(values: Sequence[float] | FloatArray) -> Effect:

@@ -236,7 +236,7 @@ def refine_setting(
     The search is over the logarithm. An effect without a positive real setting, or at the end of its family, is
     returned unchanged. Settings that an effect refines together are left to `refine_together`.
     """
-    if effect.refined:
+    if effect.refined_once_chosen:
         return refine_together(search_problem, effect, axis)
     family = next((members for members in families if effect in members), ())
     for name, value in effect.settings.items():

@@ -133,6 +133,11 @@ class Effect(ABC):
         return ()
 
     @property
+    def refined_once_chosen(self) -> tuple[str, ...]:
+        """Settings that are fitted together with the whole model only once the effect was chosen from its family."""
+        return self.refined
+
+    @property
     def is_rate(self) -> bool:
         """Whether the torque is a derivative in time, which a filter makes much smaller."""
         return self.side is GearSide.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}

@@ -130,7 +130,7 @@ class Hinge(Effect):
     name = "hinge"
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
-    refined = ("start_rad",)
+    refined_once_chosen = ("start_rad",)
 
     start_rad: Annotated[float, Range(-1e3, 1e3)]  #: q₀
     sense: Sense  #: σ, 1 where it pulls above q₀, −1 below
