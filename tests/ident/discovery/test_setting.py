@@ -45,7 +45,7 @@ def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small
 
 
 @pytest.mark.parametrize(
-    "effect", [Spring(), Cogging(3), Hinge(0.5, 1), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)]
+    "effect", [Spring(), Cogging(3), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)]
 )
 def test_a_whole_signed_or_outermost_setting_stays(small: Evidence, effect: Effect) -> None:
     assert refine_setting(search_problem_of(small), effect, 1, EFFECTS) == effect
