@@ -39,6 +39,9 @@ class RunChannels:
     #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
     clipped_percent: FloatArray
     held: HeldChannels | None  #: readings that were held; None where none was
+    #: Share of the samples of each moving motor in which its drive gave less than the reference, shape (m,).
+    limited_percent: FloatArray
+    torque_limits: FloatArray  #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
     limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
 
 
@@ -61,8 +64,19 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
     for motor in range(len(kinds)):
         own = data.current_a[usable[:, motor], motor]
         is_constant[motor] = len(own) >= LEAST_SAMPLES and not still[motor] and np.ptp(own) == 0.0
-    mounting = None if data.payload is None else data.payload.mounting
-    return RunChannels(data.name, mounting, still, moved, is_constant, percent, data.held, limits)
+    none = np.zeros(len(kinds))
+    return RunChannels(
+        run=data.name,
+        mounting=None if data.payload is None else data.payload.mounting,
+        still=still,
+        range=moved,
+        constant_current=is_constant,
+        clipped_percent=percent,
+        held=data.held,
+        limited_percent=none,
+        torque_limits=np.full(len(kinds), np.nan),
+        limits=limits,
+    )
 
 
 def require_live_currents(run: RunChannels, axes: Sequence[str]) -> None:
@@ -81,6 +95,21 @@ def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
     for run in runs:
         for axis in np.flatnonzero(run.clipped_percent > 0.0).tolist():
             yield _clip_diagnosis(run, axis, axes[axis])
+
+
+def limit_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
+    """Name drives that gave less current than their reference asked for; these samples were left out."""
+    for run in runs:
+        for axis in np.flatnonzero(run.limited_percent > 0.0).tolist():
+            yield Diagnosis(
+                "current-limited",
+                (run.run,),
+                (axes[axis],),
+                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque shows at most "
+                f"{run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the samples were left out",
+                "a drive that gives the current that its reference asks for",
+                "raise the limit of the current in the drive, or record slower moves or with a lighter payload",
+            )
 
 
 def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:

@@ -16,12 +16,13 @@ from ident.data.run_channels import RunChannels, channels_of, require_live_curre
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
 from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
-from ident.equations.rows import Rows
+from ident.equations.rows import Rows, rows_of
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
+from ident.estimators.limited_currents import limited_currents, noting_limits, without_limited
 from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
 from ident.estimators.refusals import (
@@ -121,7 +122,44 @@ def identify(
         return found
     datasets = tuple(data for data, _ in kept)
     observation = observe(model, datasets, conditioning, system, [rows for _, rows in kept])
-    return replace(found, gathered=(datasets, observation))
+    return without_limited_currents(replace(found, gathered=(datasets, observation)), fixed_gains)
+
+
+def without_limited_currents(found: Identification, fixed_gains: FloatArray | None = None) -> Identification:
+    """Fit again without the samples in which a drive gave less current than its reference asked for.
+
+    Args:
+        found: with its rows; where no drive did so, it is returned as it is.
+        fixed_gains: known gains, shape (m,).
+
+    Raises:
+        DataUnfit, RankDeficient, NotConverged: too little is left.
+    """
+    if found.gathered is None:
+        return found
+    datasets, rows = found.gathered
+    limits = limited_currents(rows, found.estimate)
+    if not limits:
+        return found
+    model, conditioning, method = found.model, found.conditioning, found.estimate.method
+    kept = tuple(without_limited(data, limits) for data in datasets)
+    built = [(data, tuple(rows_of(model, data, conditioning))) for data in kept]
+    of_fit = len(found.channels)
+    system = regrouped(reduce_built(model, built[:of_fit], instruments=method is Method.IV))
+    holdout = found.holdout
+    if holdout is not None:
+        unseen = reduce_built(model, built[of_fit:], payloads=system.payloads)
+        holdout = regrouped(unseen, system.base, system.payload_columns)
+    return replace(
+        found,
+        system=system,
+        holdout=holdout,
+        estimate=estimate_with(method, system, fixed_gains),
+        gathered=(kept, observe(model, kept, conditioning, system, [pieces for _, pieces in built])),
+        channels=tuple(
+            noting_limits(channels, data, limits) for channels, data in zip(found.channels, datasets, strict=False)
+        ),
+    )
 
 
 BuiltRun = tuple[Dataset, Sequence[Rows]]  #: A differentiated run and its rows, piece by piece

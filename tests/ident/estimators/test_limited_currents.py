@@ -1,0 +1,93 @@
+"""Drives that give less current than their reference asks for are found by the torque; what is no such drive is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.data.run import Run
+from ident.errors import Diagnosis
+from ident.estimators.diagnosis import diagnose
+from ident.estimators.estimate import Identification
+from ident.estimators.identify import identify
+from tests.ident.mistaken import AXES, SMALL, small_recordings
+from tests.ident.recordings import three_axes_truth
+
+TRUTH = three_axes_truth()
+AXIS = 1
+GIVEN = 0.9
+"""Share of the largest current of a run from which on the reference asks for more. The motion is that of a recording
+without a limit, so the current that it needs beyond this share differs by a tenth."""
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Run]:
+    """Two runs without load and two with it, in turn."""
+    return small_recordings(TRUTH, 0, seconds=40.0)
+
+
+def winding_up(run: Run, limit_a: float) -> Run:
+    """The run with a reference of J2 that winds up wherever the motor needs what its drive gives at most."""
+    current = run.current_a.copy()
+    own = current[:, AXIS]
+    times = 2.5 + np.sin(11.0 * run.time_s)
+    current[:, AXIS] = np.where(np.abs(own) > GIVEN * limit_a, times * own, own)
+    return replace(run, current_a=current)
+
+
+def largest_a(runs: list[Run]) -> float:
+    return max(float(np.abs(run.current_a[:, AXIS]).max()) for run in runs)
+
+
+def fitted(runs: list[Run], *, keep_rows: bool = True) -> Identification:
+    return identify(TRUTH.model, runs, SMALL, axes=AXES, keep_rows=keep_rows)
+
+
+def limits_named(found: Identification) -> list[Diagnosis]:
+    return [one for one in diagnose(found, AXES) if one.name == "current-limited"]
+
+
+def test_a_drive_that_gives_less_is_named_and_its_samples_are_left_out(runs: list[Run]) -> None:
+    limit_a = largest_a(runs)
+    used = [winding_up(run, limit_a) for run in runs]
+    found = fitted(used)
+    named = limits_named(found)
+    assert {axis for one in named for axis in one.axes} == {AXES[AXIS]}
+    assert found.channels[-1].torque_limits[AXIS] == pytest.approx(limit_a, rel=0.12)
+    with_all = fitted(used, keep_rows=False)
+    error, before = (abs(one.estimate.gains[AXIS] / TRUTH.gains[AXIS] - 1.0) for one in (found, with_all))
+    assert before > 0.02
+    assert error < 0.5 * before
+    z = (found.estimate.gains - TRUTH.gains) / found.estimate.gains_std
+    assert np.abs(z).max() < 3.0
+
+
+def test_recordings_without_a_limit_have_none(runs: list[Run]) -> None:
+    found = fitted(runs)
+    assert limits_named(found) == []
+    assert np.isnan(found.channels[0].torque_limits).all()
+
+
+def test_a_blow_is_no_limit(runs: list[Run]) -> None:
+    """What asks for more at any current, as a contact does, has no plateau."""
+    rng = np.random.default_rng(0)
+    struck = []
+    for run in runs:
+        current = run.current_a.copy()
+        for start in rng.integers(500, len(current) - 500, 6).tolist():
+            current[start : start + 60, AXIS] += np.sign(current[start, AXIS]) * 0.8 * largest_a(runs)
+        struck.append(replace(run, current_a=current))
+    assert limits_named(fitted(struck)) == []
+
+
+def test_a_motor_that_weakens_is_no_limit(runs: list[Run]) -> None:
+    """Saturation asks for more and more, but the torque goes on to grow."""
+    half_a = 1.5 * largest_a(runs)
+    weak = []
+    for run in runs:
+        current = run.current_a.copy()
+        current[:, AXIS] *= 1.0 + (current[:, AXIS] / half_a) ** 2
+        weak.append(replace(run, current_a=current))
+    assert limits_named(fitted(weak)) == []
