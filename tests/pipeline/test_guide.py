@@ -67,7 +67,7 @@ def test_the_guide_is_followed_to_the_letter(
     monkeypatch.chdir(tmp_path)
     named: set[str | None] = set()
     walk(list(commands), 0, capfd, named)
-    assert named == {None, "scan", "plan", "record", "fit", "residual", "apply"}
+    assert named == {None, "scan", "calibrate", "record", "fit", "residual", "apply"}
 
 
 def walk(commands: list[Command], status: int, capfd: pytest.CaptureFixture[str], named: set[str | None]) -> None:
