@@ -216,11 +216,11 @@ def _sources(path: Path) -> dict[str, Path]:
 
 
 def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
-    """Read the cell file and what it names.
+    """Read the cell file and what belongs to it.
 
     Raises:
-        ConfigurationMissing: a file cannot be read. One that the cell file names is missing where the cell file alone
-            was copied, so the message says where the name is.
+        ConfigurationMissing: a file cannot be read. Where a cell file was copied alone, the others are missing, so the
+            message says to copy them.
     """
     cell_file = sources[CELL]
     content = {CELL: read_yaml_bytes(cell_file)}
@@ -230,8 +230,9 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
         content[name] = read_file(
             source,
             ConfigurationMissing,
-            expected=f"a file that {cell_file} names, of at most {MAX_BYTES} bytes",
-            remedy=f"copy it to this place, or correct its name in {cell_file.name}; names are relative to that file",
+            expected=f"a file that belongs to {cell_file}, of at most {MAX_BYTES} bytes",
+            remedy=f"copy it to this place, or correct its name in {cell_file.name} or in the drive profile; a name is "
+            "relative to the file that has it",
         )
     return content
 

@@ -86,53 +86,6 @@ def spring(moment: Moment, axis: int, stiffness_nm_per_rad: float, rest_rad: flo
     moment.torque_nm[axis] -= stiffness_nm_per_rad * (moment.position_rad[axis] - rest_rad)
 
 
-def cable(
-    moment: Moment,
-    axis: int,
-    other_axis: float,
-    radius_m: float,
-    other_radius_m: float,
-    stiffness_n_per_m: float,
-    rest_m: float,
-) -> None:
-    """A stiff hose along two joints, led around each of them at a radius: it pulls where stretched, and pushes else.
-
-    Its way is r_i q_i + r_j q_j, and its force the stiffness times what the way is beyond `rest_m`. A negative radius
-    is the other side of a joint. `other_axis` is the number of the other joint, from 1 as a person counts.
-    """
-    _pull(moment, axis, other_axis, (radius_m, other_radius_m), stiffness_n_per_m, rest_m, -math.inf)
-
-
-def slack_cable(
-    moment: Moment,
-    axis: int,
-    other_axis: float,
-    radius_m: float,
-    other_radius_m: float,
-    stiffness_n_per_m: float,
-    rest_m: float,
-) -> None:
-    """A cable along two joints as `cable`, but one that only pulls: before `rest_m` it hangs slack."""
-    _pull(moment, axis, other_axis, (radius_m, other_radius_m), stiffness_n_per_m, rest_m, 0.0)
-
-
-def _pull(
-    moment: Moment,
-    axis: int,
-    other_axis: float,
-    radii_m: tuple[float, float],
-    stiffness_n_per_m: float,
-    rest_m: float,
-    least_m: float,
-) -> None:
-    """Take the force of what is stretched along two joints from both of them; the stretch is at least `least_m`."""
-    other = int(other_axis) - 1
-    way_m = radii_m[0] * moment.position_rad[axis] + radii_m[1] * moment.position_rad[other]
-    force_n = stiffness_n_per_m * max(least_m, way_m - rest_m)
-    moment.torque_nm[axis] -= radii_m[0] * force_n
-    moment.torque_nm[other] -= radii_m[1] * force_n
-
-
 def counterbalance(
     moment: Moment,
     axis: int,
@@ -274,6 +227,43 @@ class Coupling:
 
 
 @dataclass(slots=True)
+class Cable:
+    """A stiff hose along two joints, led around each of them at a radius: it pulls where stretched, and pushes else.
+
+    Its way is r_i q_i + r_j q_j, and its force the stiffness times what the way is beyond `rest_m`. A negative radius
+    is the other side of a joint.
+    """
+
+    axis: int  #: one joint
+    other_axis: float  #: number of the other joint, from 1 as a person counts
+    radius_m: float  #: around the one joint
+    other_radius_m: float  #: around the other joint
+    stiffness_n_per_m: float  #: of the cable
+    rest_m: float  #: way at which it has no force
+
+    def __call__(self, moment: Moment) -> None:
+        """Take the cable's force from both joints."""
+        other = int(self.other_axis) - 1
+        way_m = self.radius_m * moment.position_rad[self.axis] + self.other_radius_m * moment.position_rad[other]
+        force_n = self.stiffness_n_per_m * self.stretch_m(way_m)
+        moment.torque_nm[self.axis] -= self.radius_m * force_n
+        moment.torque_nm[other] -= self.other_radius_m * force_n
+
+    def stretch_m(self, way_m: float) -> float:
+        """By how much a way stretches it; negative where it is pressed."""
+        return way_m - self.rest_m
+
+
+@dataclass(slots=True)
+class SlackCable(Cable):
+    """A cable that only pulls: before `rest_m` it hangs slack."""
+
+    def stretch_m(self, way_m: float) -> float:
+        """By how much a way stretches it."""
+        return max(0.0, way_m - self.rest_m)
+
+
+@dataclass(slots=True)
 class Elasticity:
     """A spring and a damper in the drive of one motor: the motor becomes a coordinate of its own (two masses)."""
 
@@ -323,7 +313,7 @@ class Lag:
         reported_a[self.axis] = self.value_a
 
 
-WithState = TemperatureFriction | Presliding | Coupling | Elasticity
+WithState = TemperatureFriction | Presliding | Coupling | Cable | Elasticity
 
 UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "stribeck": stribeck,
@@ -332,8 +322,8 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "nonlinear-viscous": nonlinear_viscous,
     "asymmetric-viscous": asymmetric_viscous,
     "spring": spring,
-    "cable": cable,
-    "slack-cable": slack_cable,
+    "cable": Cable,
+    "slack-cable": SlackCable,
     "counterbalance": counterbalance,
     "position-friction": position_friction,
     "cogging": cogging,

@@ -64,7 +64,6 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
     for motor in range(len(kinds)):
         own = data.current_a[usable[:, motor], motor]
         is_constant[motor] = len(own) >= LEAST_SAMPLES and not still[motor] and np.ptp(own) == 0.0
-    none = np.zeros(len(kinds))
     return RunChannels(
         run=data.name,
         mounting=None if data.payload is None else data.payload.mounting,
@@ -73,7 +72,7 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
         constant_current=is_constant,
         clipped_percent=percent,
         held=data.held,
-        limited_percent=none,
+        limited_percent=np.zeros(len(kinds)),
         torque_limits=np.full(len(kinds), np.nan),
         limits=limits,
     )
@@ -130,23 +129,22 @@ def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
     for run in runs:
         if run.held is None:
             continue
-        for what, share, hold_s in (
-            ("positions", run.held.position_share, run.held.position_hold_s),
-            ("currents", run.held.current_share, run.held.current_hold_s),
-        ):
-            held = np.flatnonzero(share).tolist()
-            if held:
-                names = tuple(axes[axis] for axis in held)
-                yield _held_diagnosis(run.run, what, names, float(share[held].max()), float(np.median(hold_s[held])))
+        if run.held.position_share.any():
+            yield _held_diagnosis(run.run, "positions", axes, run.held.position_share, run.held.position_hold_s)
+        if run.held.current_share.any():
+            yield _held_diagnosis(run.run, "currents", axes, run.held.current_share, run.held.current_hold_s)
 
 
-def _held_diagnosis(run: str, what: str, axes: tuple[str, ...], share: float, hold_s: float) -> Diagnosis:
+def _held_diagnosis(run: str, what: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray) -> Diagnosis:
+    held = np.flatnonzero(share).tolist()
+    percent = 100.0 * float(np.max(share))
+    typical_ms = 1e3 * float(np.median(hold_s[held]))
     return Diagnosis(
         "readings-held",
         (run,),
-        axes,
-        f"{what} that repeat the reading before while the robot moves, in up to {100.0 * share:.0f} % of the samples, "
-        f"for some {1e3 * hold_s:.3g} ms; what lies between two new readings was filled in",
+        tuple(axes[axis] for axis in held),
+        f"{what} that repeat the reading before while the robot moves, in up to {percent:.0f} % of the samples, for "
+        f"some {typical_ms:.3g} ms; what lies between two new readings was filled in",
         "a new reading in every sample",
         "record at the rate at which the controller answers, or let it answer at the rate of the recording; noise of a "
         "current between the readings is lost, and makes the error larger",

@@ -16,7 +16,7 @@ from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_exp
 from ident.discovery.gates import Gates
 from ident.discovery.refinement import is_strictly_possible, refine_together
 from ident.effects.effect import Effect, is_placeable
-from ident.effects.position import Cable, SlackCable
+from ident.effects.position import AlongTwoJoints, SlackCable
 
 DIRECTIONS = 12  #: Of the way of a cable, tried on a pair of joints
 SHARES_OF_WAY = (0.1, 0.3, 0.5, 0.7)  #: Of the rows in which a cable is still slack, where it begins to pull
@@ -37,7 +37,7 @@ def propose_cables(
         gates: what a cable explains of a motor's squared residual must reach their least share.
         families: the dictionary; without cables in it nothing is proposed.
     """
-    cables = tuple(family for family in families if isinstance(family[0], Cable | SlackCable))
+    cables = tuple(family for family in families if isinstance(family[0], AlongTwoJoints))
     grid = next((family for family in cables if isinstance(family[0], SlackCable)), ())
     if not grid or search_problem.folds.moves < grid[0].least_moves:
         return {}

@@ -38,7 +38,7 @@ from ident.discovery.refinement import refine_together
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
-from ident.effects.position import Cable, Compensator, Counterbalance, Hinge, SlackCable, Spring
+from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
@@ -185,7 +185,7 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
     if not passed:
         return None
     best = passed[0]
-    if isinstance(best.effect, Cable | SlackCable):
+    if isinstance(best.effect, AlongTwoJoints):
         best = next((found for found in passed if _is_simpler_than_cable(found, best)), best)
     alike = [
         finding

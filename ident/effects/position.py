@@ -148,7 +148,20 @@ class Hinge(Effect):
 
 
 @dataclass(frozen=True, slots=True)
-class Cable(Effect):
+class AlongTwoJoints(Effect):
+    """A cable or hose that is led along two joints."""
+
+    side = GearSide.TWO_JOINTS
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    reach = CABLE_REACH
+    least_moves = CABLE_MOVES
+
+    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
+
+
+@dataclass(frozen=True, slots=True)
+class Cable(AlongTwoJoints):
     """τ_i = a q_i + b q_j and τ_j = b q_i + c q_j, with the torques at zero in the declared offsets;  a, c > 0.
 
     Source: Hooke's law of a cable or hose that both joints stretch. One potential gives both torques,
@@ -157,18 +170,11 @@ class Cable(Effect):
     """
 
     name = "cable"
-    side = GearSide.TWO_JOINTS
-    reach = CABLE_REACH
-    least_moves = CABLE_MOVES
-    declares = Property.INDEPENDENT_OF_VELOCITY
-    abscissa = Abscissa.POSITION
     coefficients = (
         Column("stiffness", "Nm/rad", least=0.0),
         Column("shared stiffness", "Nm/rad"),
         Column("other stiffness", "Nm/rad", least=0.0),
     )
-
-    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 3, k)."""
@@ -181,7 +187,7 @@ class Cable(Effect):
 
 
 @dataclass(frozen=True, slots=True)
-class SlackCable(Effect):
+class SlackCable(AlongTwoJoints):
     """τ_i = c h cos φ and τ_j = c h sin φ,  h = max(0, q_i cos φ + q_j sin φ − s₀);  c > 0: it pulls beyond s₀.
 
     A cable along two joints that hangs slack before s₀: its potential is ½ c h². φ says how much of its way each joint
@@ -190,22 +196,17 @@ class SlackCable(Effect):
     """
 
     name = "slack-cable"
-    side = GearSide.TWO_JOINTS
-    reach = CABLE_REACH
-    least_moves = CABLE_MOVES
-    declares = Property.INDEPENDENT_OF_VELOCITY
-    abscissa = Abscissa.POSITION
     coefficients = (Column("stiffness", "Nm/rad", least=0.0),)
     refined = ("direction_rad", "start_rad")
 
-    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
     direction_rad: Annotated[float, Range(-10.0, 10.0)]  #: φ
     start_rad: Annotated[float, Range(-1e3, 1e3)] = 0.0  #: s₀
 
     def way(self, signals: Signals, axis: int) -> FloatArray:
         """Way of the cable along both joints, per unit of its radius [rad], shape (k,)."""
-        cosine, sine = np.cos(self.direction_rad), np.sin(self.direction_rad)
-        return np.asarray(cosine * signals.position_rad[axis] + sine * signals.position_rad[self.other_axis - 1])
+        on_own = np.cos(self.direction_rad) * signals.position_rad[axis]
+        on_other = np.sin(self.direction_rad) * signals.position_rad[self.other_axis - 1]
+        return np.asarray(on_own + on_other)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 1, k)."""

@@ -22,7 +22,7 @@ from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
-from ident.estimators.limited_currents import limited_currents, noting_limits, without_limited
+from ident.estimators.limited_currents import LimitedCurrent, limited_currents, noting_limits, without_limited
 from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
 from ident.estimators.refusals import (
@@ -122,43 +122,48 @@ def identify(
         return found
     datasets = tuple(data for data, _ in kept)
     observation = observe(model, datasets, conditioning, system, [rows for _, rows in kept])
-    return without_limited_currents(replace(found, gathered=(datasets, observation)), fixed_gains)
+    found = replace(found, gathered=(datasets, observation))
+    limits = limited_currents(observation, estimate)
+    return _without_limited_currents(found, datasets, limits, fixed_gains) if limits else found
 
 
-def without_limited_currents(found: Identification, fixed_gains: FloatArray | None = None) -> Identification:
+def _without_limited_currents(
+    found: Identification,
+    datasets: Sequence[Dataset],
+    limits: Sequence[LimitedCurrent],
+    fixed_gains: FloatArray | None,
+) -> Identification:
     """Fit again without the samples in which a drive gave less current than its reference asked for.
 
     Args:
-        found: with its rows; where no drive did so, it is returned as it is.
+        found: the fit with all samples.
+        datasets: all its runs, held-out runs last.
+        limits: of its drives.
         fixed_gains: known gains, shape (m,).
 
     Raises:
         DataUnfit, RankDeficient, NotConverged: too little is left.
     """
-    if found.gathered is None:
-        return found
-    datasets, rows = found.gathered
-    limits = limited_currents(rows, found.estimate)
-    if not limits:
-        return found
-    model, conditioning, method = found.model, found.conditioning, found.estimate.method
+    model = found.model
+    conditioning = found.conditioning
+    method = found.estimate.method
     kept = tuple(without_limited(data, limits) for data in datasets)
-    built = [(data, tuple(rows_of(model, data, conditioning))) for data in kept]
-    of_fit = len(found.channels)
-    system = regrouped(reduce_built(model, built[:of_fit], instruments=method is Method.IV))
+    rows = [tuple(rows_of(model, data, conditioning)) for data in kept]
+    built = list(zip(kept, rows, strict=True))
+    fit_runs = len(found.channels)
+    system = regrouped(reduce_built(model, built[:fit_runs], instruments=method is Method.IV))
     holdout = found.holdout
     if holdout is not None:
-        unseen = reduce_built(model, built[of_fit:], payloads=system.payloads)
-        holdout = regrouped(unseen, system.base, system.payload_columns)
+        rest = reduce_built(model, built[fit_runs:], payloads=system.payloads)
+        holdout = regrouped(rest, system.base, system.payload_columns)
+    noted = zip(found.channels, datasets[:fit_runs], strict=True)
     return replace(
         found,
         system=system,
         holdout=holdout,
         estimate=estimate_with(method, system, fixed_gains),
-        gathered=(kept, observe(model, kept, conditioning, system, [pieces for _, pieces in built])),
-        channels=tuple(
-            noting_limits(channels, data, limits) for channels, data in zip(found.channels, datasets, strict=False)
-        ),
+        gathered=(kept, observe(model, kept, conditioning, system, rows)),
+        channels=tuple(noting_limits(channels, data, limits) for channels, data in noted),
     )
 
 

@@ -23,7 +23,7 @@ BEYOND_SIGMAS = 6.0  #: By how much a reference exceeds the predicted current th
 PLATEAU = 0.1  #: Of a limit, by which predicted currents differ where it acts
 LEAST_ON_PLATEAU = 0.8  #: Share of the rows beyond the limit whose predicted current is on the plateau
 LARGEST_SLOPE = 0.25
-"""Of the predicted current over the reference, beyond the limit. Where a motor weakens, its torque goes on to grow."""
+"""Slope of the predicted current over the reference beyond the limit. Where a motor weakens, its torque grows on."""
 LEAST_MISSING = 0.9  #: Share of the rows with a reference well beyond the limit whose torque lacks it
 SAFE = 0.95  #: Of a limit, from which on samples are left out: it is known to some percent
 
@@ -34,7 +34,6 @@ class LimitedCurrent:
 
     motor: int  #: index
     limit_a: float  #: that the torque shows, in the unit of the currents
-    largest_a: float  #: reference
 
 
 def limited_currents(observation: Observation, estimate: Estimate) -> tuple[LimitedCurrent, ...]:
@@ -53,7 +52,7 @@ def limited_currents(observation: Observation, estimate: Estimate) -> tuple[Limi
         reference_a = observation.current[motor, use]
         limit_a = _limit(reference_a, torque_nm[use] / estimate.gains[motor])
         if limit_a is not None:
-            found.append(LimitedCurrent(motor, limit_a, float(np.max(np.abs(reference_a)))))
+            found.append(LimitedCurrent(motor, limit_a))
     return tuple(found)
 
 

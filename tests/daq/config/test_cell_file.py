@@ -288,7 +288,8 @@ def test_a_cell_file_copied_without_its_robot_says_which_file_to_copy(configurat
     with pytest.raises(ConfigurationMissing) as raised:
         load_cell(copied)
     assert "kr270.urdf" in raised.value.subject
-    assert "kr270.yaml names" in raised.value.expected
+    assert "belongs to" in raised.value.expected
+    assert "kr270.yaml" in raised.value.expected
     assert "copy it" in raised.value.remedy
 
 

@@ -56,6 +56,7 @@ def test_a_held_motion_is_filled_in(seed: int, samples: int, count: float) -> No
     assert channel.hold_s == pytest.approx(samples / RATE_HZ)
     inside = slice(50, -50)
     worst = np.abs(channel.values - motion)[inside].max()
+    # Where the motion turns, a reading changes by less than JUMP_COUNTS, and stays.
     assert worst < 3.0 * count + 0.1 * np.abs(stale(read, samples) - motion)[inside].max()
 
 
@@ -91,7 +92,7 @@ def test_what_was_read_stays_what_it_was() -> None:
     assert np.array_equal(filled[~held], read[~held])
 
 
-def test_channels_are_told_apart() -> None:
+def test_a_channel_that_is_not_held_stays_beside_one_that_is() -> None:
     position = np.stack((waves(1), stale(waves(2), 5)), axis=1)
     current = np.stack((stale(waves(3), 4), waves(4)), axis=1)
     filled_position, filled_current, held = fill_held(position, current, RATE_HZ)

@@ -1,0 +1,106 @@
+"""What recorder and drive can do to a recording: held readings of a real arm, a drive that gives less than asked.
+
+Run by `make damage-study`; minutes. The held readings need the TX-40's recording in ../shared/data or $DRIVEGAIN_DATA:
+each reading of its positions, its currents or both is held for a while, and the error of the whole arm is that of a fit
+with the nameplate gains. The drive is simulated: that of J4 gives 1.6 A at most where its reference asks for more.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from drivers.simulation.spec import UndeclaredEffect
+from ident.arrays import FloatArray
+from ident.data.run import Run
+from ident.estimators.diagnosis import diagnose
+from ident.estimators.identify import identify
+from tests.studies.effect_cells import EffectCase
+from tests.studies.effect_runs import CaseTask, load_runs, make_case
+from tests.studies.output import print_line
+from tests.studies.real_runs import Recording, data_folder, tx40
+from tests.studies.study_cells import world_cell
+from tests.studies.study_plans import CELL, make_plan
+
+OUT = Path("out/damaged-recordings")
+HOLDS_S = (0.002, 0.005, 0.010)
+WORLD = "measurement"
+LIMITED = EffectCase("limited-J4", 2322, (UndeclaredEffect("clipped-current", 3, {"limit_a": 1.6}),))
+NOISE_HZ = 300.0  #: From which on the currents of the real arm hold noise alone
+
+
+def held(channels: FloatArray, samples: int) -> FloatArray:
+    """Channels of which every reading stays for so many samples, shape (k, n)."""
+    rows = np.arange(len(channels)) // samples * samples
+    return np.asarray(channels[rows])
+
+
+def held_readings(recording: Recording) -> None:
+    """Print the error of a real arm with readings that are held."""
+    (run,) = recording.runs
+    print_line(f"as recorded: {_error_percent(recording, run):.2f} %")
+    for hold_s in HOLDS_S:
+        samples = round(hold_s * run.rate_hz)
+        position = replace(run, position_rad=held(run.position_rad, samples))
+        current = replace(run, current_a=held(run.current_a, samples))
+        both = replace(position, current_a=current.current_a)
+        errors = [_error_percent(recording, one) for one in (position, current, both)]
+        of_each = "positions {:.2f} %, currents {:.2f} %, both {:.2f} %".format(*errors)
+        print_line(f"held for {1e3 * hold_s:g} ms: {of_each}")
+    noise_a = _noise_a(run)
+    print_line(f"noise of the currents above {NOISE_HZ:g} Hz: {', '.join(f'{one:.3f}' for one in noise_a)} A")
+
+
+def _error_percent(recording: Recording, run: Run) -> float:
+    model = model_of(recording.cell)
+    found = identify(model, (run,), recording.cell.conditioning, fixed_gains=recording.gains)
+    return found.training_error.total
+
+
+def _noise_a(run: Run) -> list[float]:
+    """Root mean square of each current above NOISE_HZ [A]."""
+    spectrum = np.fft.rfft(run.current_a, axis=0)
+    frequency_hz = np.fft.rfftfreq(len(run.current_a), 1.0 / run.rate_hz)
+    spectrum[frequency_hz < NOISE_HZ] = 0.0
+    noise = np.fft.irfft(spectrum, len(run.current_a), axis=0)
+    rms: list[float] = np.sqrt(np.mean(noise**2, axis=0)).tolist()
+    return rms
+
+
+def limited_drive() -> None:
+    """Print the gain of a motor whose drive gives less than its reference, with and without these samples."""
+    task = CaseTask(OUT, WORLD, LIMITED)
+    for plan in task.plans:
+        make_plan(plan)
+    make_case(task)
+    runs = load_runs(task, imported=False)
+    cell = load_cell(CELL)
+    motor = LIMITED.effects[0].axis
+    truth = world_cell(LIMITED.seed, WORLD).bare.axes[motor].gain_nm_per_a
+    for words, keep_rows in (("with all samples", False), ("without what it did not give", True)):
+        found = identify(model_of(cell), runs.fit, cell.conditioning, keep_rows=keep_rows)
+        error = 100.0 * (found.estimate.gains[motor] / truth - 1.0)
+        std = 100.0 * found.estimate.gains_std[motor] / abs(truth)
+        left = found.training_error.axes[motor]
+        print_line(f"{words}: gain {error:+.2f} ± {std:.2f} % off, error of the axis {left:.1f} %")
+        for one in diagnose(found, cell.axis_names):
+            print_line(f"  {one.text}")
+
+
+def main() -> int:
+    """Make the study and print its figures."""
+    if (data_folder() / "tx40").is_dir():
+        held_readings(tx40(data_folder()))
+    else:
+        print_line(f"found no {data_folder() / 'tx40'}; the held readings are left out")
+    limited_drive()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
