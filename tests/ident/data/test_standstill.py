@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, Decimator
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
+from ident.equations.rows import row_filter, row_masks
 from ident.errors import DataUnfit
 from ident.estimators.identify import identify
 from tests.ident.recordings import CONDITIONING, Truth
@@ -87,6 +88,25 @@ def test_without_current_noise_only_standstill_biases_the_gains(truth: Truth, cl
     assert derived < 2e-4
     assert declared < 2e-4
     assert never > 1e-2
+
+
+def test_rows_that_count_hold_little_of_the_friction_at_rest(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    # By the exact positions, which know nothing of the low-pass and of the standstill speed.
+    loose = replace(DERIVED, standstill_share=0.1)
+    for run in clean_runs:
+        least, most = (_largest_share_of_rest(truth, run, choice) for choice in (DERIVED, loose))
+        assert least < 0.005
+        assert most > 5.0 * least
+
+
+def _largest_share_of_rest(truth: Truth, run: Run, conditioning: Conditioning) -> float:
+    """Largest share of its dry friction that a row can have from a joint at rest, over all rows that count."""
+    data = differentiate(run, truth.model.drive_train, conditioning)
+    use, _ = row_masks(truth.model, data, conditioning)
+    taps = row_filter(data, conditioning)
+    weights = Decimator(np.abs(taps.taps), taps.factor)
+    share = weights(_at_rest(run)[1:-1].T.astype(np.float64))
+    return float(share[use].max())
 
 
 @pytest.mark.parametrize("noise_rad", [0.0, ENCODER_NOISE_RAD, 1e-4])
