@@ -28,7 +28,7 @@ class Conditioning:
     standstill_rad_s: tuple[float, ...] = ()
     #: A row is left out when standstill fills more than this share of its filter window. A joint at rest holds any torque
     #: up to its dry friction: with 0.1, rows beside a stop carry enough of it to look like presliding on a quiet arm.
-    standstill_share: float = 0.02
+    standstill_share: float = 0.05
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""
