@@ -4,7 +4,7 @@
 source relative to what the fit leaves, ± σ, or "-" where there is none. Then, for each noise world and source, how
 many lower limits are above the error of the fit, which is of the right model: one in twenty, if the limit is a bound.
 Simulated cells repeat one plan, twice without and twice with load, or with `--apart` have a plan for each run, so that
-standstill is the only source; `--worlds quiet --apart --duration 40` is like the demonstration. The real KR300 and
+standstill is the only source; `--worlds clean --apart --duration 40` is like the demonstration. The real KR300 and
 TX-40, from ../shared/data or $DRIVEGAIN_DATA, repeat nothing.
 """
 
@@ -40,7 +40,7 @@ from tests.studies.study_cells import WORLDS, declared_payload, spec_of, study_c
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 
 
-QUIET = "quiet"  #: World of the clean cell itself, with noise in the currents alone
+UNCHANGED = "clean"  #: World of the clean cell itself, with its own noise in the currents alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
 def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple[Cell, list[Run]]:
     """Four runs of one plan, or of one plan each."""
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    truth = study_cell(seed) if world == QUIET else world_cell(seed, world)
+    truth = study_cell(seed) if world == UNCHANGED else world_cell(seed, world)
     plans = [plan(cell, seed=10 * seed + number, duration_s=duration_s) for number in range(4 if apart else 1)]
     runs: list[Run] = []
     for number, payload in enumerate((None, "disc", None, "disc")):
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.floor_study", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--worlds", choices=(*WORLDS, QUIET), nargs="+", default=list(WORLDS))
+    parser.add_argument("--worlds", choices=(*WORLDS, UNCHANGED), nargs="+", default=list(WORLDS))
     parser.add_argument("--duration", type=float, default=20.0, help="of each simulated run [s]")
     parser.add_argument("--apart", action="store_true", help="a plan for each run: no move is repeated")
     options = parser.parse_args(arguments)
