@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
-from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, PivotFriction, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
     AxisSpec,
@@ -72,6 +72,10 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
             shared = np.zeros(total)
             shared[[effect.axis, effect.other]] = 1.0
             directions.append(shared)
+        if isinstance(effect, PivotFriction):
+            effect.direction = len(directions)
+            effect.row = np.concatenate((effect.row, np.zeros(total - joints)))
+            directions.append(effect.row)
     lone = [np.flatnonzero(row)[0] if np.count_nonzero(row) == 1 else -1 for row in directions]
     mechanics = Mechanics(
         motor_direction=motor_direction,
@@ -153,6 +157,11 @@ class Plant:
             self._order = self.mechanism.order
         effects = [build_effect(effect, n, passive_joints) for effect in spec.effects]
         self._joints = n + len(passive_joints)
+        for effect in effects:
+            if isinstance(effect, PivotFriction):
+                if self.mechanism is None:
+                    raise SpecInvalid(f"closure {effect.closure!r}: the robot is not a closed chain")
+                effect.row = self.mechanism.turning(self._model, effect.closure)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
