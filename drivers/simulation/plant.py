@@ -155,13 +155,8 @@ class Plant:
             mobility = self.mechanism.mobility
             passive_joints = self.mechanism.joints[n:]
             self._order = self.mechanism.order
-        effects = [build_effect(effect, n, passive_joints) for effect in spec.effects]
         self._joints = n + len(passive_joints)
-        for effect in effects:
-            if isinstance(effect, PivotFriction):
-                if self.mechanism is None:
-                    raise SpecInvalid(f"closure {effect.closure!r}: the robot is not a closed chain")
-                effect.row = self.mechanism.turning(self._model, effect.closure)
+        effects = self._build_effects(spec, passive_joints)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
@@ -209,6 +204,21 @@ class Plant:
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self._refuse_stiff(flexible, spec)
         self.set_brakes(np.ones(n, dtype=np.bool_))
+
+    def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
+        """Build the undeclared effects; pivots with friction learn how they turn with the joints.
+
+        Raises:
+            SpecInvalid: an effect or its parameters do not exist, or a closure is missing or no planar pivot.
+        """
+        effects = [build_effect(effect, len(spec.axes), passive_joints) for effect in spec.effects]
+        for effect in effects:
+            if not isinstance(effect, PivotFriction):
+                continue
+            if self.mechanism is None:
+                raise SpecInvalid(f"closure {effect.closure!r}: the robot is not a closed chain")
+            effect.row = self.mechanism.turning(self._model, effect.closure)
+        return effects
 
     def _refuse_stiff(self, flexible: Sequence[Elasticity], spec: CellSpec) -> None:
         """Refuse a drive whose motor and links would swing faster than the steps can follow.

@@ -27,7 +27,8 @@ from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, p
 
 ALIKE = 1e-7  #: Difference of two joints' speeds, relative to the largest, below which they turn alike
 PARALLEL = 1e-6  #: Sine of the angle between two axes that count as parallel
-BESIDE = (0.0, 0.06, -0.09)  #: Motions from the assembly pose at which joints are compared [rad, or of the robot's size]
+BESIDE = (0.0, 0.06, -0.09)
+"""Lengths of the motions from the assembly pose after which speeds are compared [rad or m]."""
 
 
 def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
@@ -141,7 +142,7 @@ def _is_planar(robot: Robot, pivot: Pivot) -> bool:
     about = _axis(robot, placed, pivot)
     loop = _loop(robot, robot.closures[pivot.closure])
     across = [np.linalg.norm(np.cross(about, _joint_axis(robot, placed, joint))) for joint in loop]
-    return max(across, default=0.0) <= PARALLEL
+    return bool(max(across, default=0.0) <= PARALLEL)
 
 
 def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
