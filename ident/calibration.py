@@ -212,7 +212,8 @@ class Calibration:
     #: Root mean square of what is left of each motor's current on the held-out run, filtered as in the fit [A, or the
     #: unit of the gains' current]; of the fit for a motor that did not move there. None in earlier versions.
     current_residual: tuple[float, ...] | None = None
-    passive_joints: tuple[str, ...] = ()  #: joints of a closed chain without a motor, on which effects can act, too
+    #: Joints of a closed chain without a motor, then the pivots that its loops are cut at: effects can act there, too.
+    passive_joints: tuple[str, ...] = ()
     #: How the gains depend on the mass of each payload whose mass is known; empty for fixed gains, and in calibrations
     #: of earlier versions.
     payload_mass: tuple[PayloadMass, ...] = ()
@@ -302,7 +303,7 @@ def calibration_of(
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
     gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
     responses = mass_responses(found.system, estimate)
-    passive = found.model.robot.passive_names
+    passive = found.model.robot.undriven_names
     places = (*axes, *passive)
     return Calibration(
         cell=robot,

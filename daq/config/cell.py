@@ -29,7 +29,7 @@ from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import Joint, JointKind, Robot
+from ident.model.robot import JointKind, Robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,17 +228,17 @@ class Cell:
 
     @property
     def place_names(self) -> tuple[str, ...]:
-        """Where an effect can act: the axes, then the joints of a closed chain without a motor (`Robot.places`)."""
-        return (*self.axis_names, *(joint.name for joint in self._passive))
+        """Where an effect can act: the axes, a closed chain's joints without a motor, its pivots (`Robot.places`)."""
+        undriven = () if self.chain is None else self.chain.undriven_names
+        return (*self.axis_names, *undriven)
 
     @property
     def place_units(self) -> tuple[JointUnit, ...]:
         """Unit of each of `place_names`."""
-        return (*(axis.unit for axis in self.axes), *(joint_unit(joint.kind) for joint in self._passive))
-
-    @property
-    def _passive(self) -> tuple[Joint, ...]:
-        return () if self.chain is None else self.chain.passive_joints
+        passive = () if self.chain is None else self.chain.passive_joints
+        pivots = () if self.chain is None else self.chain.pivots
+        kinds = [joint.kind for joint in passive] + [JointKind.REVOLUTE for _ in pivots]
+        return (*(axis.unit for axis in self.axes), *map(joint_unit, kinds))
 
 
 def robot_of(cell: Cell) -> Robot:

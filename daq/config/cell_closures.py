@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import Annotated, Literal
 from xml.etree import ElementTree
@@ -57,6 +57,12 @@ class ClosedChain:
     platform: str | None  #: link that carries the payload; that of the last joint when None
     assembly_rad: dict[str, float]  #: roughly, positions of all joints at which the closures hold [rad or m]
     passive_joints: tuple[Joint, ...]  #: joints without a motor, in the order of the URDF's tree
+    pivots: tuple[str, ...] = ()  #: names of the joints that the loops are cut at and that turn about one axis
+
+    @property
+    def undriven_names(self) -> tuple[str, ...]:
+        """Where an effect can act without a motor, in the order of `Robot.places`."""
+        return (*(joint.name for joint in self.passive_joints), *self.pivots)
 
 
 def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> ClosedChain | None:
@@ -71,7 +77,9 @@ def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
     passive = tuple(joint for joint in read_urdf(urdf).joints if joint.name not in robot.motors)
-    return ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
+    chain = ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
+    closed = robot_with(chain, urdf, (0.0, 0.0, -9.81))
+    return replace(chain, pivots=closed.undriven_names[len(passive) :])
 
 
 def platform_frame(robot: ChainModel, urdf: str) -> Place:

@@ -88,8 +88,8 @@ def cell_from_bundle(
     check(document, model, urdf, profiles, logged=file is None)
     controller = None if model.controller is None else model.controller.file
     chain = chain_of(model.robot, model.closures, urdf)
-    passive = () if chain is None else chain.passive_joints
-    places = model.axis_names + [joint.name for joint in passive]
+    undriven = () if chain is None else chain.undriven_names
+    places = [*model.axis_names, *undriven]
     mounted = platform_frame(model.robot, urdf)
     used = (CELL, URDF, *members.values())
     return Cell(

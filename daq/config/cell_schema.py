@@ -209,7 +209,12 @@ class EffectModel(StrictModel):
     """An effect that the robot is known to have, and its settings where they are known."""
 
     name: Name
-    axis: Annotated[Name, Field(description="Name of the axis, or of a closed chain's joint without a motor.")]
+    axis: Annotated[
+        Name,
+        Field(
+            description="Name of the axis, of a closed chain's joint without a motor, or `pivot` and a closure's name."
+        ),
+    ]
     settings: dict[str, float] = Field(default_factory=dict)
 
 

@@ -251,7 +251,7 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
         return
     from daq.config.effects import place_effect  # noqa: PLC0415 - loads scipy, which cells without effects do not need
 
-    passive = () if robot is None else robot.passive_names
+    passive = () if robot is None else robot.undriven_names
     names = [*model.axis_names, *passive]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):

@@ -137,7 +137,8 @@ def _sections(cell: Cell) -> dict[str, object]:
     return {
         "robot.urdf": cell.urdf,
         GRAVITY: cell.gravity_m_s2,
-        "closures": None if chain is None else replace(chain, passive_joints=()),  # these follow from the URDF
+        # Joints without a motor and pivots follow from the rest.
+        "closures": None if chain is None else replace(chain, passive_joints=(), pivots=()),
         "drive_train.ratio": cell.ratio.tolist(),
         "bus": cell.buses,
         "sync": cell.sync,

@@ -111,23 +111,25 @@ def axis_index(axis: str | int) -> int:
 
 
 class PlantedEffectModel(StrictModel):
-    """An undeclared effect, on an axis or on a passive joint of a closed chain."""
+    """An undeclared effect, on an axis, on a passive joint of a closed chain, or in the pivot of a closure."""
 
     name: Annotated[str, Field(min_length=1)]
     axis: AxisName | None = None
     joint: Annotated[str, Field(min_length=1)] | None = None
+    closure: Annotated[str, Field(min_length=1)] | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_place(self) -> PlantedEffectModel:
-        if (self.axis is None) == (self.joint is None):
-            raise ValueError("axis, or joint for a passive joint: one of them")
+        given = [place for place in (self.axis, self.joint, self.closure) if place is not None]
+        if len(given) != 1:
+            raise ValueError("axis, or joint for a passive joint, or closure for a pivot: one of them")
         return self
 
     def effect(self) -> UndeclaredEffect:
         """As the plant knows it."""
         axis = -1 if self.axis is None else axis_index(self.axis)
-        return UndeclaredEffect(self.name, axis, dict(self.parameters), self.joint)
+        return UndeclaredEffect(self.name, axis, dict(self.parameters), self.joint, self.closure)
 
 
 class SimulationModel(StrictModel):

@@ -38,6 +38,8 @@ ASSEMBLY_STEP = 0.2  #: Largest change of a joint in one of them [rad or m]
 
 ASSEMBLY_LEAPS = 50  #: Poses on the way from the assembly to the start
 
+PLANAR = 1e-6  #: Largest part of a pivot's turning about another axis than its own, or that changes with the pose
+
 START_TOLERANCE = 1e-3  #: Largest correction of a start position of redundant drives [rad or m]
 
 
@@ -359,6 +361,29 @@ class Mechanism:
         evaluate(self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian)
         return error, jacobian
 
+    def turning(self, model: pin.Model, closure: str) -> FloatArray:
+        """Return how the two links of a planar pivot turn against each other with each joint, shape (n,).
+
+        They are entries 1, -1 and 0 at every pose where all joints of the loop turn about one direction; the links of
+        any other closure turn against each other by a row that changes with the pose.
+
+        Raises:
+            SpecInvalid: there is no such closure, or it is no planar pivot.
+        """
+        found = [one for one in self._closures if one.name == closure]
+        if not found:
+            names = ", ".join(one.name for one in self._closures)
+            raise SpecInvalid(f"no closure {closure!r}; there are {names}")
+        ends = [model.getFrameId(link, pin.FrameType.BODY) for link in (found[0].first, found[0].second)]
+        # A second pose, to see whether the rows stay.
+        poses = (self.start_rad, self.start_rad + np.linspace(0.2, 0.4, len(self.joints)))
+        rows = [_relative_turning(model, ends, self.order, pose) for pose in poses]
+        about = int(np.argmax(np.abs(rows[0]).sum(axis=1)))
+        others = np.delete(rows[0], about, axis=0)
+        if np.abs(others).max() > PLANAR or np.abs(rows[1] - rows[0]).max() > PLANAR:
+            raise SpecInvalid(f"closure {closure}: its links turn against each other about more than one direction")
+        return np.asarray(np.round(rows[0][about]))
+
     def closed(self, position_rad: FloatArray, held: Sequence[int] = (0,)) -> FloatArray:
         """Return the position nearest to a rough one that the closures allow, by Newton's method.
 
@@ -408,6 +433,18 @@ class Mechanism:
                 f"{position[worst]:.6g} with the others; expected start positions that agree to {START_TOLERANCE:g}"
             )
         return position
+
+
+def _relative_turning(model: pin.Model, ends: Sequence[int], order: IntArray, position_rad: FloatArray) -> FloatArray:
+    """Return the angular velocity of the second frame less that of the first, in the first, per joint, shape (3, n)."""
+    data = model.createData()
+    configuration = np.empty(len(order))
+    configuration[order] = position_rad
+    pin.computeJointJacobians(model, data, configuration)
+    pin.updateFramePlacements(model, data)
+    angular = [pin.getFrameJacobian(model, data, end, pin.LOCAL_WORLD_ALIGNED)[3:] for end in ends]
+    to_first = data.oMf[ends[0]].rotation.T
+    return np.asarray((to_first @ (angular[1] - angular[0]))[:, order])
 
 
 def _rank(matrix: FloatArray) -> int:

@@ -227,6 +227,24 @@ class Coupling:
 
 
 @dataclass(slots=True)
+class PivotFriction:
+    """Friction in the joint that a closed chain is cut at, dry and viscous: on the relative turn of two links."""
+
+    closure: str  #: name of the closure
+    coulomb_nm: float = 0.0  #: dry part
+    viscous_nm_s_rad: float = 0.0  #: viscous part
+    #: Index of its direction of dry friction, and how it turns with each coordinate, filled in by the plant.
+    direction: int = field(default=-1, init=False)
+    row: FloatArray = field(default_factory=lambda: np.zeros(0), init=False)  #: shape (N,)
+
+    def __call__(self, moment: Moment) -> None:
+        """Set the bound of its dry friction and add its viscous part."""
+        moment.bound_nm[self.direction] += self.coulomb_nm
+        turning_rad_s = float(self.row @ moment.velocity_rad_s)
+        moment.torque_nm -= self.row * (self.viscous_nm_s_rad * turning_rad_s)
+
+
+@dataclass(slots=True)
 class Cable:
     """A stiff hose along two joints, led around each of them at a radius: it pulls where stretched, and pushes else.
 
@@ -357,6 +375,26 @@ OF_MOTORS = (
 """Effects that need a motor."""
 
 
+PIVOT_FRICTION = "pivot-friction"
+"""Friction of a closure, which is on no axis and no joint of the tree."""
+
+
+def _pivot_friction(effect: UndeclaredEffect) -> PivotFriction:
+    """Build the friction of a closure.
+
+    Raises:
+        SpecInvalid: it names no closure, or another parameter than those of friction.
+    """
+    if effect.closure is None:
+        raise SpecInvalid(f"{PIVOT_FRICTION}: no closure; name the one that the pivot closes")
+    unknown = sorted(set(effect.parameters) - {"coulomb_nm", "viscous_nm_s_rad"})
+    if unknown:
+        raise SpecInvalid(
+            f"{PIVOT_FRICTION}: unknown parameter {', '.join(unknown)}; its parameters are coulomb_nm, viscous_nm_s_rad"
+        )
+    return PivotFriction(effect.closure, **effect.parameters)
+
+
 def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] = ()) -> Effect | Lag:
     """Build the physics of an undeclared effect for a cell with a number of axes.
 
@@ -368,9 +406,13 @@ def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] =
     Raises:
         SpecInvalid: the name, a parameter or the axis does not exist, or a parameter is missing.
     """
+    if effect.name == PIVOT_FRICTION:
+        return _pivot_friction(effect)
+    if effect.closure is not None:
+        raise SpecInvalid(f"{effect.name}: acts on no closure; only {PIVOT_FRICTION} does")
     physics = UNDECLARED_EFFECTS.get(effect.name)
     if physics is None:
-        names = ", ".join(UNDECLARED_EFFECTS)
+        names = ", ".join((*UNDECLARED_EFFECTS, PIVOT_FRICTION))
         raise SpecInvalid(f"undeclared effect {effect.name!r} does not exist; there are {names}")
     joint = effect.axis
     if effect.joint is not None:

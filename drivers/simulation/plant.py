@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
-from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, PivotFriction, build_effect
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
     AxisSpec,
@@ -72,6 +72,10 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
             shared = np.zeros(total)
             shared[[effect.axis, effect.other]] = 1.0
             directions.append(shared)
+        if isinstance(effect, PivotFriction):
+            effect.direction = len(directions)
+            effect.row = np.concatenate((effect.row, np.zeros(total - joints)))
+            directions.append(effect.row)
     lone = [np.flatnonzero(row)[0] if np.count_nonzero(row) == 1 else -1 for row in directions]
     mechanics = Mechanics(
         motor_direction=motor_direction,
@@ -151,8 +155,8 @@ class Plant:
             mobility = self.mechanism.mobility
             passive_joints = self.mechanism.joints[n:]
             self._order = self.mechanism.order
-        effects = [build_effect(effect, n, passive_joints) for effect in spec.effects]
         self._joints = n + len(passive_joints)
+        effects = self._build_effects(spec, passive_joints)
         self._mechanics, flexible = lay_out(spec, effects, self._joints)
         self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
@@ -200,6 +204,21 @@ class Plant:
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self._refuse_stiff(flexible, spec)
         self.set_brakes(np.ones(n, dtype=np.bool_))
+
+    def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
+        """Build the undeclared effects; pivots with friction learn how they turn with the joints.
+
+        Raises:
+            SpecInvalid: an effect or its parameters do not exist, or a closure is missing or no planar pivot.
+        """
+        effects = [build_effect(effect, len(spec.axes), passive_joints) for effect in spec.effects]
+        for effect in effects:
+            if not isinstance(effect, PivotFriction):
+                continue
+            if self.mechanism is None:
+                raise SpecInvalid(f"closure {effect.closure!r}: the robot is not a closed chain")
+            effect.row = self.mechanism.turning(self._model, effect.closure)
+        return effects
 
     def _refuse_stiff(self, flexible: Sequence[Elasticity], spec: CellSpec) -> None:
         """Refuse a drive whose motor and links would swing faster than the steps can follow.

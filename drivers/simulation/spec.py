@@ -92,6 +92,7 @@ class UndeclaredEffect:
     axis: int  #: index of the joint, from 0; of a closed chain that of the motor
     parameters: dict[str, float]  #: by name, with units in the names
     joint: str | None = None  #: joint of the URDF in place of the axis, for the passive joints of a closed chain
+    closure: str | None = None  #: closure in place of both, for the friction of the pivot that it is
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,8 @@ class Signals:
     current_a: FloatArray  #: the same in the unit of the current reference
     #: Of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
-    #: Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k); empty without any.
+    #: Torque at each axis per unit of torque on each joint without a motor, then on each pivot that a loop is cut at,
+    #: shape (u, m, k); empty without any.
     leverage: FloatArray = field(default_factory=lambda: np.empty((0, 0, 0)))
     #: What made the torques; None where they were not made of a model. Effects that change the geometry need it.
     arm: Arm | None = None
@@ -233,9 +234,11 @@ def declared_signals(
     load, geared, total = model.torques(motion, standard)
     position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
     if model.robot.closures:
-        followed, joints = model.follow(motion), [*model.robot.axis_joints, *model.robot.passive_joints]
-        states = followed.joints.position_rad, followed.joints.velocity_rad_s, followed.joints.acceleration_rad_s2
-        position, velocity, acceleration = (state[:, joints] for state in states)
+        followed = model.follow(motion)
+        placed = model.at_places(followed)
+        position = placed.position_rad
+        velocity = placed.velocity_rad_s
+        acceleration = placed.acceleration_rad_s2
         leverage = model.leverage(followed)
     motor = model.drive_train.to_motor @ total
     began = None if data.started_s is None or session_began_s is None else data.started_s - session_began_s

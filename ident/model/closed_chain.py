@@ -88,7 +88,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
     jacobian = loops(robot, position[None], size_m).jacobian[0]
-    free = _null_space(jacobian)
+    free = null_space(jacobian)
     found = free.shape[1]
     if mobility is not None and found != mobility:
         raise ModelError(
@@ -373,7 +373,7 @@ def _independent(free: FloatArray) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def _null_space(jacobian: FloatArray) -> FloatArray:
+def null_space(jacobian: FloatArray) -> FloatArray:
     """Motions of the joints that the closures leave free, shape (n, d)."""
     _, values, ways = np.linalg.svd(jacobian)
     rank = int(np.sum(values > SMALLEST_RANK * values.max(initial=0.0)))
@@ -389,7 +389,7 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
         for _ in range(MAX_ITERATIONS):
             closing = loops(robot, beside[None], size_m)
             beside -= np.linalg.lstsq(closing.jacobian[0], closing.residual[0], rcond=1e-8)[0]
-        moved = _null_space(loops(robot, beside[None], size_m).jacobian[0])
+        moved = null_space(loops(robot, beside[None], size_m).jacobian[0])
         best = max(best, int(np.linalg.matrix_rank(moved[list(robot.axis_joints)], tol=1e-6)))
     return best
 

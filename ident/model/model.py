@@ -19,6 +19,7 @@ from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
+from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
 from ident.model.robot import JointKind, Motion, Robot
 
@@ -371,10 +372,23 @@ class Model:
         return self.at_axes(followed, np.einsum("idk,kda->iak", per_x, per_axis))
 
     def leverage(self, followed: TreeMotion) -> FloatArray:
-        """Torque at each axis per unit of torque on each joint without a motor, shape (n − m, m, k)."""
+        """Torque at each axis per unit of torque on each place without a motor (`Robot.places`), shape (u, m, k)."""
         unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
         torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
+        per_joint = pivot_rates(self.robot, followed.joints.position_rad)
+        torque = np.concatenate((torque, np.transpose(per_joint, (2, 1, 0))), axis=1)
         return np.ascontiguousarray(np.swapaxes(self.at_axes(followed, torque), 0, 1))
+
+    def at_places(self, followed: TreeMotion) -> Motion:
+        """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k, places)."""
+        joints = [*self.robot.axis_joints, *self.robot.passive_joints]
+        tree = followed.joints
+        pivots = pivot_motion(self.robot, self.assembly, tree)
+        return Motion(
+            np.concatenate((tree.position_rad[:, joints], pivots.position_rad), axis=1),
+            np.concatenate((tree.velocity_rad_s[:, joints], pivots.velocity_rad_s), axis=1),
+            np.concatenate((tree.acceleration_rad_s2[:, joints], pivots.acceleration_rad_s2), axis=1),
+        )
 
     def at_axes(self, followed: TreeMotion, torque: FloatArray) -> FloatArray:
         """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m, …, k)."""

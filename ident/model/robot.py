@@ -38,6 +38,8 @@ class Place:
     translation_m: FloatArray  #: its origin there, (3,)
 
 
+PIVOT = "pivot"  #: What the name of a closure follows in the name of the joint that the loop was cut at
+
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Along and about the axes of the first frame of a closure."""
 
@@ -56,6 +58,14 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True)
+class Pivot:
+    """A joint at which a loop is cut, and that turns about one axis; see `ident.model.pivots`."""
+
+    closure: int  #: index of the closure among the robot's
+    axis: int  #: axis of the closure's first frame that it turns about: 0, 1 or 2
+
+
+@dataclass(frozen=True, slots=True)
 class Robot:
     """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a motor."""
 
@@ -68,6 +78,8 @@ class Robot:
     platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
     #: Gravity before its direction was corrected, shape (3,); None where it was not.
     declared_gravity_m_s2: FloatArray | None = None
+    #: Joints at which loops are cut and in which friction can be told from that of every joint of the tree.
+    pivots: tuple[Pivot, ...] = ()
 
     @property
     def joint_count(self) -> int:
@@ -101,13 +113,31 @@ class Robot:
 
     @property
     def places(self) -> tuple[Joint, ...]:
-        """Where an effect can act: the driven joints, then those without a motor."""
-        return (*self.axes, *(self.joints[joint] for joint in self.passive_joints))
+        """Where an effect can act: the driven joints, those without a motor, and the pivots that loops are cut at."""
+        passive = (self.joints[joint] for joint in self.passive_joints)
+        return (*self.axes, *passive, *map(self._as_joint, self.pivots))
+
+    def _as_joint(self, pivot: Pivot) -> Joint:
+        closure = self.closures[pivot.closure]
+        first = closure.first
+        return Joint(
+            name=f"{PIVOT} {closure.name}",
+            kind=JointKind.REVOLUTE,
+            parent=first.joint,
+            rotation=first.rotation,
+            translation_m=first.translation_m,
+            axis=np.eye(3)[pivot.axis],
+        )
 
     @property
     def passive_names(self) -> tuple[str, ...]:
         """Names of the joints without a motor."""
         return tuple(self.joints[joint].name for joint in self.passive_joints)
+
+    @property
+    def undriven_names(self) -> tuple[str, ...]:
+        """Names of the places without a motor, in the order of `places`; a pivot is named after its closure."""
+        return tuple(joint.name for joint in self.places[self.axis_count :])
 
     @property
     def axis_count(self) -> int:

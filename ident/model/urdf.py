@@ -8,7 +8,7 @@ joints' names, fixed joints merged into the moving joint before them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, cos, inf, isfinite, sin, sqrt
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
@@ -17,6 +17,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import Body
+from ident.model.pivots import cut_pivots
 from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robot, poses
 
 HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
@@ -105,7 +106,7 @@ def robot_from_urdf(
     if carrier is not None and carrier.joint < 0:
         raise ModelError(f"the platform {platform!r} does not move; expected the link that carries the payload")
     pose = np.array([(assembly_rad or {}).get(joint.name, 0.0) for joint in found.joints])
-    return Robot(
+    robot = Robot(
         joints=found.joints,
         gravity_m_s2=np.asarray(gravity_m_s2, dtype=np.float64),
         closures=tuple(closed),
@@ -113,6 +114,7 @@ def robot_from_urdf(
         assembly_rad=pose if closed else None,
         platform=carrier,
     )
+    return replace(robot, pivots=cut_pivots(robot)) if closed else robot
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,207 @@
+"""Pivots that a closed chain is cut at: joints without a motor that the tree of joints does not have.
+
+A loop is cut at one of its joints, and closed again by equations (`ident.model.robot.Closure`). Where the two frames of
+a closure can only turn about one axis a of the first of them, the cut joint is a pivot. With the angular velocities of
+the two links, its speed and its power are
+
+    ψ̇ = a · (ω₂ − ω₁) = J_ψ q̇,    τ_ψ ψ̇ = (J_ψᵀ τ_ψ)ᵀ q̇,
+
+so that a torque τ_ψ in the pivot acts as J_ψᵀ τ_ψ on the joints of the tree (virtual power, as for a passive joint in
+Briot & Gautier, Multibody System Dynamics 2015). Both links turn about parallel axes on their way to the pivot, or the
+closure holds the other two angles; then a · (ω₂ − ω₁) counts every revolute joint of the loop.
+
+A ball joint turns about three axes at once and has no such angle: it is no pivot here, and friction in it has no name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.errors import ModelError
+from ident.model.closed_chain import CLOSED, MAX_ITERATIONS, Assembly, assemble, null_space
+from ident.model.closures import loops
+from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, poses
+
+ALIKE = 1e-7  #: Difference of two joints' speeds, relative to the largest, below which they turn alike
+PARALLEL = 1e-6  #: Sine of the angle between two axes that count as parallel
+BESIDE = (0.0, 0.06, -0.09)
+"""Lengths of the motions from the assembly pose after which speeds are compared [rad or m]."""
+
+
+def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
+    """Find the pivots that loops are cut at, and in which friction differs from that of every joint of the tree.
+
+    In a parallelogram, opposite joints turn alike at every pose; friction in one of them is friction in the other for
+    the motors. Such a pivot is left out, so that an effect has one name.
+
+    Args:
+        robot: with closures.
+
+    Returns:
+        one a closure at most, in their order; none where the closures cannot be closed (`assemble` says why).
+    """
+    candidates = [_pivot_of(robot, index) for index in range(len(robot.closures))]
+    turning = tuple(pivot for pivot in candidates if pivot is not None)
+    if not turning:
+        return ()
+    try:
+        assembly = assemble(robot)
+    except ModelError:
+        return ()
+    whole = replace(robot, pivots=turning)
+    speeds = _speeds_beside(whole, assembly)
+    known = [speeds[:, joint] for joint in range(robot.joint_count)]
+    found = []
+    for number, pivot in enumerate(turning):
+        own = speeds[:, robot.joint_count + number]
+        scale = float(np.abs(own).max())
+        alike = [min(np.abs(own - one).max(), np.abs(own + one).max()) <= ALIKE * scale for one in known]
+        if scale > 0.0 and not any(alike):
+            found.append(pivot)
+            known.append(own)
+    return tuple(found)
+
+
+def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
+    """Speed of each pivot per unit of each joint's, J_ψ.
+
+    Args:
+        robot: with p pivots and n joints.
+        position_rad: of the joints [rad or m], shape (k, n).
+
+    Returns:
+        shape (k, p, n) [1, or rad/m of a prismatic joint: zero].
+    """
+    rates = np.zeros((len(position_rad), len(robot.pivots), robot.joint_count))
+    if not robot.pivots:
+        return rates
+    placed = poses(robot, position_rad)
+    for number, pivot in enumerate(robot.pivots):
+        about = _axis(robot, placed, pivot)
+        for joint, sign in _loop(robot, robot.closures[pivot.closure]).items():
+            rates[:, number, joint] = sign * np.einsum("ki,ki->k", about, _joint_axis(robot, placed, joint))
+    return rates
+
+
+def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
+    """Motion of the p pivots from that of all n joints, arrays of shape (k, p).
+
+    An angle is zero where the two frames of the closure are parallel. It is the one within half a turn of the angle at
+    the assembly pose. The relative angular acceleration is that of joints about axes that the links before them turn,
+
+        ψ̈ = J_ψ q̈ + a · Σ ± ω_parent × (a_j q̇_j).
+
+    Args:
+        robot: with p pivots.
+        assembly: of the robot.
+        joints: motion of all joints, arrays of shape (k, n).
+    """
+    samples = len(joints.position_rad)
+    rates = pivot_rates(robot, joints.position_rad)
+    velocity = np.einsum("kpn,kn->kp", rates, joints.velocity_rad_s)
+    acceleration = np.einsum("kpn,kn->kp", rates, joints.acceleration_rad_s2)
+    position = np.zeros((samples, len(robot.pivots)))
+    if not robot.pivots:
+        return Motion(position, velocity, acceleration)
+    placed = poses(robot, joints.position_rad)
+    assembled = poses(robot, assembly.position_rad[None])
+    turning = _angular_velocities(robot, placed, joints.velocity_rad_s)
+    for number, pivot in enumerate(robot.pivots):
+        middle = _angle(robot, assembled, pivot)
+        away = _angle(robot, placed, pivot) - middle
+        position[:, number] = middle + np.arctan2(np.sin(away), np.cos(away))
+        about = _axis(robot, placed, pivot)
+        for joint, sign in _loop(robot, robot.closures[pivot.closure]).items():
+            before = turning[robot.joints[joint].parent + 1]
+            along = _joint_axis(robot, placed, joint) * joints.velocity_rad_s[:, joint, None]
+            swung = np.cross(before, along)
+            acceleration[:, number] += sign * np.einsum("ki,ki->k", about, swung)
+    return Motion(position, velocity, acceleration)
+
+
+def _pivot_of(robot: Robot, index: int) -> Pivot | None:
+    """Return the pivot that a closure is of; None of one that turns about no axis or about several."""
+    closure = robot.closures[index]
+    lengths = [axis for axis, name in enumerate("xyz") if name in closure.directions]
+    free = [axis for axis, name in enumerate("xyz") if f"r{name}" not in closure.directions]
+    if len(free) == 1:
+        return Pivot(index, free[0])
+    if len(free) < 3 or len(lengths) != 2:
+        return None
+    (about,) = {0, 1, 2}.difference(lengths)
+    pivot = Pivot(index, about)
+    return pivot if _is_planar(robot, pivot) else None
+
+
+def _is_planar(robot: Robot, pivot: Pivot) -> bool:
+    """Whether every revolute joint of the loop turns about the pivot's axis: it then does so at every position."""
+    placed = poses(robot, np.zeros((1, robot.joint_count)))
+    about = _axis(robot, placed, pivot)
+    loop = _loop(robot, robot.closures[pivot.closure])
+    across = [np.linalg.norm(np.cross(about, _joint_axis(robot, placed, joint))) for joint in loop]
+    return bool(max(across, default=0.0) <= PARALLEL)
+
+
+def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
+    """Revolute joints of a loop: 1 where one turns the second frame, −1 where it turns the first."""
+    signs: dict[int, float] = {}
+    for place, sign in ((closure.second, 1.0), (closure.first, -1.0)):
+        joint = place.joint
+        while joint >= 0:
+            if robot.joints[joint].kind is JointKind.REVOLUTE:
+                signs[joint] = signs.get(joint, 0.0) + sign
+            joint = robot.joints[joint].parent
+    return {joint: sign for joint, sign in signs.items() if sign != 0.0}
+
+
+def _joint_axis(robot: Robot, placed: Poses, joint: int) -> FloatArray:
+    """Axis of a joint in the base, shape (k, 3)."""
+    return np.asarray(placed.rotation[joint + 1] @ robot.joints[joint].axis)
+
+
+def _axis(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
+    """Axis of a pivot in the base, shape (k, 3)."""
+    first = robot.closures[pivot.closure].first
+    return np.asarray(placed.rotation[first.joint + 1] @ first.rotation[:, pivot.axis])
+
+
+def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
+    """Angle of a pivot, between −π and π, shape (k,)."""
+    closure = robot.closures[pivot.closure]
+    frame = placed.rotation[closure.first.joint + 1] @ closure.first.rotation
+    other = placed.rotation[closure.second.joint + 1] @ closure.second.rotation
+    turned = np.swapaxes(frame, 1, 2) @ other
+    following = (pivot.axis + 1) % 3
+    last = (pivot.axis + 2) % 3
+    return np.asarray(np.arctan2(turned[:, last, following], turned[:, following, following]))
+
+
+def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray) -> FloatArray:
+    """Angular velocity of the base and of every link, shape (n + 1, k, 3)."""
+    turning = np.zeros((robot.joint_count + 1, len(velocity_rad_s), 3))
+    for index, joint in enumerate(robot.joints):
+        turning[index + 1] = turning[joint.parent + 1]
+        if joint.kind is JointKind.REVOLUTE:
+            turning[index + 1] += _joint_axis(robot, placed, index) * velocity_rad_s[:, index, None]
+    return turning
+
+
+def _speeds_beside(robot: Robot, assembly: Assembly) -> FloatArray:
+    """Speeds of all joints and pivots in free motions at and beside the assembly pose, shape (motions, n + p)."""
+    draw = np.random.default_rng(0)
+    found = []
+    for size in BESIDE:
+        free = null_space(loops(robot, assembly.position_rad[None], assembly.size_m).jacobian[0])
+        position = assembly.position_rad + size * free @ draw.standard_normal(free.shape[1])
+        for _ in range(MAX_ITERATIONS):
+            closing = loops(robot, position[None], assembly.size_m)
+            if np.abs(closing.residual).max() < CLOSED:
+                break
+            position = position - np.linalg.lstsq(closing.jacobian[0], closing.residual[0], rcond=1e-8)[0]
+        joints = null_space(loops(robot, position[None], assembly.size_m).jacobian[0])
+        pivots = pivot_rates(robot, position[None])[0] @ joints
+        found.append(np.concatenate((joints, pivots)).T)
+    return np.concatenate(found)

@@ -1,0 +1,178 @@
+"""Friction of the pivots that closed chains are cut at, over the whole driver path: what `residual` names.
+
+    python -m tests.studies.pivot_friction
+    python -m tests.studies.pivot_friction --only five-bar-tip-0.3 five-bar-clean-1
+
+Twelve cells have such friction, in each pivot of the shipped planar robots at three sizes, and six have none. A
+finished cell is kept in out/pivot-study/ while its row and its files are the same. Prints a line for each, and writes
+docs/evidence/data/pivots.csv once all are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from daq.cli.app import main as drivegain
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import ExitCode
+from daq.files import replace_file
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.spec import UndeclaredEffect
+from tests.pipeline.cells import as_json, record_job
+from tests.studies.fingerprint import digest, made_once
+
+OUT = Path("out/pivot-study")
+TABLE = Path("docs/evidence/data/pivots.csv")
+SECONDS = 20.0  #: Of each of the two runs
+VISCOUS_S_RAD = 0.2  #: Viscous friction per unit of dry friction
+FAMILY = "passive-friction"
+
+
+@dataclass(frozen=True, slots=True)
+class PivotCell:
+    """A shipped cell, and the friction of one of its pivots."""
+
+    robot: str  #: shipped cell and simulation
+    closure: str | None  #: whose pivot has friction; None of a cell without any
+    dry_nm: float  #: dry friction
+    seed: int  #: of plan and noise
+
+    @property
+    def name(self) -> str:
+        """Name for files and options."""
+        if self.closure is None:
+            return f"{self.robot}-clean-{self.seed}"
+        return f"{self.robot}-{self.closure}-{self.dry_nm:g}"
+
+    @property
+    def effects(self) -> tuple[UndeclaredEffect, ...]:
+        """Effects of the plant."""
+        if self.closure is None:
+            return ()
+        parameters = {"coulomb_nm": self.dry_nm, "viscous_nm_s_rad": VISCOUS_S_RAD * self.dry_nm}
+        return (UndeclaredEffect("pivot-friction", -1, parameters, closure=self.closure),)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the row and of the files that it names."""
+        cell = shipped_configurations() / "cells" / f"{self.robot}.yaml"
+        simulation = shipped_simulation(self.robot)
+        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        return digest(self, files)
+
+
+PIVOTS = (("five-bar", "tip"), ("dualv", "arm-2"), ("dualv", "arm-3"), ("dualv", "arm-4"))
+SIZES_NM = {"five-bar": (0.3, 0.6, 1.2), "dualv": (0.15, 0.3, 0.6)}
+"""A half, one and two times the dry friction of a drive of the robot."""
+
+
+def cells() -> tuple[PivotCell, ...]:
+    """Every cell of the study: with friction, then clean."""
+    found = []
+    for number, (robot, closure) in enumerate(PIVOTS):
+        for place, size_nm in enumerate(SIZES_NM[robot]):
+            found.append(PivotCell(robot, closure, size_nm, seed=1 + 3 * number + place))
+    for robot in SIZES_NM:
+        found += [PivotCell(robot, None, 0.0, seed) for seed in (21, 22, 23)]
+    return tuple(found)
+
+
+def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
+    """Record a run without load and one with the weighed payload, and search: what is named, and the gains' errors."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        job, logs = record_job(
+            cell.robot, folder, seconds=SECONDS, pairs=1, seed=cell.seed, exchanges=0, effects=cell.effects
+        )
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        code = drivegain(["residual", *map(str, logs), "--json"])
+    assert code == ExitCode.OK, f"drivegain residual ended with {code}"
+    found = as_json(printed.getvalue())
+    changes = found["gain_changes"]
+    before = [100.0 * (one["before"] / job.truth[one["axis"]] - 1.0) for one in changes]
+    after = [100.0 * (one["after"] / job.truth[one["axis"]] - 1.0) for one in changes]
+    added = [one for turn in found["turns"] for one in turn["added"]]
+    place = None if cell.closure is None else f"pivot {cell.closure}"
+    sizes = [
+        coefficient
+        for one in added
+        if (one["effect"], one["axis"]) == (FAMILY, place)
+        for coefficient in one["coefficients"]
+        if coefficient["name"] == "dry"
+    ]
+    return {
+        "cell": cell.name,
+        "planted": place or "none",
+        "dry_nm": cell.dry_nm,
+        "named": [f"{one['name']} on {one['axis']}" for one in found["effects"]],
+        "found_nm": sizes[-1]["value"] if sizes else None,
+        "found_std_nm": sizes[-1]["std"] if sizes else None,
+        "error_before_percent": found["before"]["cross_validated_error_percent"]["total"],
+        "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
+        "worst_gain_error_before_percent": max(map(abs, before), default=None),
+        "worst_gain_error_after_percent": max(map(abs, after), default=None),
+    }
+
+
+def line_of(row: dict[str, Any]) -> list[str]:
+    """One line of the table."""
+    found = "–" if row["found_nm"] is None else f"{row['found_nm']:.3f} ± {row['found_std_nm']:.3f}"
+    gains = [row["worst_gain_error_before_percent"], row["worst_gain_error_after_percent"]]
+    shown_gains = "–" if None in gains else f"{gains[0]:.2f} → {gains[1]:.2f}"
+    return [
+        row["cell"],
+        f"{row['dry_nm']:g}",
+        ", ".join(row["named"]) or "none",
+        found,
+        f"{row['error_before_percent']:.2f} → {row['error_after_percent']:.2f}",
+        shown_gains,
+    ]
+
+
+def verdict(rows: Sequence[dict[str, Any]]) -> str:
+    """Count cells that are named as what they are, other names, and clean cells that are silent."""
+    planted = [row for row in rows if row["planted"] != "none"]
+    clean = [row for row in rows if row["planted"] == "none"]
+    named = [row for row in planted if f"{FAMILY} on {row['planted']}" in row["named"]]
+    others = [row for row in planted if set(row["named"]) - {f"{FAMILY} on {row['planted']}"}]
+    silent = [row for row in clean if not row["named"]]
+    return (
+        f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; "
+        f"{len(silent)} of {len(clean)} clean cells silent"
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Study the chosen cells."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.pivot_friction", description=__doc__)
+    names = [cell.name for cell in cells()]
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    chosen = parser.parse_args(arguments).only
+    rows = []
+    for cell in cells():
+        if cell.name not in chosen:
+            continue
+        rows.append(made_once(OUT, cell.name, cell.fingerprint, partial(study_cell, cell)))
+        sys.stdout.write(f"{'; '.join(line_of(rows[-1]))}\n")
+        sys.stdout.flush()
+    sys.stdout.write(f"{verdict(rows)}\n")
+    if len(rows) == len(names):
+        table = io.StringIO()
+        writer = csv.writer(table, lineterminator="\n")
+        writer.writerow(["cell", "dry friction [Nm]", "named", "found ± σ [Nm]", "left-out error", "worst gain error"])
+        writer.writerows(map(line_of, rows))
+        replace_file(TABLE, table.getvalue().encode())
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
