@@ -72,8 +72,9 @@ class PivotCell:
 
 
 PIVOTS = (("five-bar", "tip"), ("dualv", "arm-2"), ("dualv", "arm-3"), ("dualv", "arm-4"))
-SIZES_NM = {"five-bar": (0.3, 0.6, 1.2), "dualv": (0.15, 0.3, 0.6)}
-"""A half, one and two times the dry friction of a drive of the robot."""
+SIZES_NM = {"five-bar": (0.3, 0.6, 1.2), "dualv": (0.1, 0.2, 0.3)}
+"""A half, one and two times the dry friction of a drive of the five-bar; a third to one of a DualV's. With 0.6 Nm in
+one pivot, the DualV's recording is refused: a move does not end within its time."""
 
 
 def cells() -> tuple[PivotCell, ...]:

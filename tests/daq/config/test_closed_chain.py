@@ -207,9 +207,18 @@ def test_places_of_a_cell_are_those_of_its_robot() -> None:
     for name in ("five-bar", "dualv", "orthoglide", "demo"):
         cell = load_cell(CHECKOUT / f"configs/cells/{name}.yaml")
         robot = robot_of(cell)
-        assert cell.place_names[len(cell.axes) :] == robot.passive_names
+        assert cell.place_names[len(cell.axes) :] == robot.undriven_names
         assert len(cell.place_units) == len(robot.places)
     assert load_cell(CHECKOUT / "configs/cells/five-bar.yaml").place_units[3] is DEGREE
+
+
+def test_an_effect_is_declared_on_the_pivot_that_a_loop_is_cut_at(tmp_path: Path) -> None:
+    declared = "effects:\n  - {name: passive-friction, axis: pivot tip}\nconditioning:"
+    cell = _cell(tmp_path, ("conditioning:", declared))
+    assert cell.effects == (DeclaredEffect("passive-friction", 4, {}),)
+    (placed,) = declared_effects(cell)
+    assert placed.name_among(cell.place_names) == "passive-friction on pivot tip"
+    assert cell.place_units[placed.axis] is DEGREE
 
 
 def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> None:
