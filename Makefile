@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study weigh-study stopping-study session-study warm-up-study pairs-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -183,6 +183,9 @@ stopping-study: setup
 
 session-study: setup
 	$(BIN)/python -m tests.studies.session_study --minutes 1000 --tables docs/evidence/data
+
+pairs-study: setup
+	$(BIN)/python -m tests.studies.pairs_study --tables docs/evidence/data
 
 warm-up-study: setup
 	$(BIN)/python -m tests.studies.warm_up_study
