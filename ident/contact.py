@@ -18,7 +18,8 @@ threshold u, the highest quantile with enough of them (Davison & Smith 1990). Ex
 correlation time are one peak, as they would be one alarm. Peaks beyond u follow a generalised Pareto distribution, its
 shape ξ by probability-weighted moments. Minutes of quiet motion show a heavy tail badly: the level is that of the upper
 95 % bound of ξ, but of ξ = 0, an exponential, at least, because a tail that seems to end is not believed; and of the
-upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times higher again: the scale of
+upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times higher again: the scale
+of
 the residual differs from day to day. What remains to assume: the motion to
 be watched is like the quiet motion (other loads, temperatures or speeds need their own), its residual has a scale at
 most SCALE_MARGIN times as large, and no heavier tail begins beyond the largest peak seen.

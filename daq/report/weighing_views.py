@@ -71,7 +71,7 @@ class WeighReport(Report):
     declared_kg: Figure
     mass_kg: WeighedValue
     mass_std_of_reference_kg: Figure
-    """share of σ of the mass that is the tolerance of the payload masses that the calibration was made with; in `std`"""
+    """share of σ of the mass that is the tolerance of the payload masses of the calibration; it is in `std`"""
     centre_m: WeighedValues
     centre_in_platform_m: WeighedValues | None
     inertia_about_centre_kg_m2: WeighedValues

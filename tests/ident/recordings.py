@@ -19,9 +19,9 @@ from ident.effects.signals import session_began_s
 from ident.equations.linearisation import Jacobian
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import RelativeError, relative_error
-from ident.estimators.payload_mass import mass_responses
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
+from ident.estimators.payload_mass import mass_responses
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf

@@ -185,7 +185,9 @@ def load_scores(folder: Path, world: str) -> tuple[RecordingScore, ...]:
 
 
 def _score_of(document: dict[str, Any]) -> RecordingScore:
-    fields = {name: tuple(value) if isinstance(value, list) else value for name, value in document.items()}
+    fields: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
+    }
     return RecordingScore(**fields)
 
 
