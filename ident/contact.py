@@ -19,10 +19,13 @@ correlation time are one peak, as they would be one alarm. Peaks beyond u follow
 shape ξ by probability-weighted moments. Minutes of quiet motion show a heavy tail badly: the level is that of the upper
 95 % bound of ξ, but of ξ = 0, an exponential, at least, because a tail that seems to end is not believed; and of the
 upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times higher again: the scale
-of
-the residual differs from day to day. What remains to assume: the motion to
-be watched is like the quiet motion (other loads, temperatures or speeds need their own), its residual has a scale at
-most SCALE_MARGIN times as large, and no heavier tail begins beyond the largest peak seen.
+of the residual differs from day to day. What remains to assume: the motion to be watched is like the quiet motion
+(other loads, temperatures or speeds need their own), its residual has a scale at most SCALE_MARGIN times as large, and
+no heavier tail begins beyond the largest peak seen.
+
+The allowed rate is one on average over bands, from five minutes of quiet motion on. Single bands of a heavy tail
+(Student's with five degrees of freedom) exceed it: the worst of 40 by 3.5 times after five minutes, by 1.3 times after
+thirty, at a scale SCALE_MARGIN times as large; after two minutes the average can, too (docs/evidence/contact.md).
 """
 
 from __future__ import annotations
@@ -66,7 +69,7 @@ class Band:
     threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
     correlation_s: FloatArray  #: correlation time of the residual [s], shape (m,)
     quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (m,)
-    alarms_per_hour: float  #: false alarms of all joints together, in an hour of motion
+    alarms_per_hour: float  #: false alarms of all joints together that are allowed in an hour of motion, on average
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +167,9 @@ def prediction_band(
 
     Args:
         calibration, model, conditioning: as for `external_torque`.
-        quiet: the runs; a minute or more, with the motion that is to be watched.
-        alarms_per_hour: false alarms of all joints together, in an hour of motion.
+        quiet: the runs, with the motion that is to be watched; five minutes or more for a heavy tail, and more
+            minutes give lower thresholds.
+        alarms_per_hour: false alarms of all joints together, in an hour of motion: fewer on average; see the top.
 
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
@@ -252,7 +256,7 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
 def alarm_level(
     ratio: FloatArray, time_s: FloatArray, gap_s: float, alarms_per_hour: float, observed_s: float
 ) -> float | None:
-    """Level that a signal exceeds on fewer occasions an hour than given, extrapolated from its peaks; see the top.
+    """Level that a signal exceeds, on average, less often an hour than given, extrapolated from its peaks; see the top.
 
     The signal may grow by SCALE_MARGIN.
 

@@ -285,7 +285,7 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
-        "motion like that, all axes together. Standstill is not judged."
+        "motion like that, all axes together, on average and from five quiet minutes on. Standstill is not judged."
     )
     contacts, missing = found.contacts, not_judged(found, cell)
     yield ""
