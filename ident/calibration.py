@@ -115,15 +115,26 @@ class PayloadMass:
     mass_kg: float  #: as the fit took it for known
     tolerance_kg: float  #: declared tolerance of the weighing, 0 where none is declared
     gains: tuple[MassInfluence, ...]  #: one an axis
+    #: Derivative of each of the calibration's parameters to the mass [its unit per kg], in their order; empty in
+    #: calibrations of earlier versions.
+    parameters_per_kg: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, payload: str, mass_kg: float, gain_per_kg: Sequence[float], gains: Sequence[Gain]) -> PayloadMass:
-        """Influence on gains, without a tolerance, from the derivative of each."""
+    def of(
+        cls,
+        payload: str,
+        mass_kg: float,
+        gain_per_kg: Sequence[float],
+        gains: Sequence[Gain],
+        parameters_per_kg: Sequence[float] = (),
+    ) -> PayloadMass:
+        """Influence on gains and parameters, without a tolerance, from the derivative of each."""
         influences = tuple(
             MassInfluence(gain.axis, float(slope), float(slope * mass_kg / gain.value), 0.0)
             for slope, gain in zip(gain_per_kg, gains, strict=True)
         )
-        return cls(payload, mass_kg, 0.0, influences)
+        rounded = tuple(float(f"{slope:.6g}") for slope in parameters_per_kg)
+        return cls(payload, mass_kg, 0.0, influences, rounded)
 
     def weighed_to(self, tolerance_kg: float) -> PayloadMass:
         """Return the same with the tolerance of the weighing."""
@@ -328,7 +339,8 @@ def calibration_of(
         current_residual=found.current_residual,
         passive_joints=passive,
         payload_mass=tuple(
-            PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains) for one in responses
+            PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist())
+            for one in responses
         ),
     )
 

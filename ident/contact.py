@@ -15,10 +15,17 @@ z = |τ_ext|/s times s.
 
 *Threshold.* False alarms are rarer than recordings are long, so the tail of z is extrapolated by its peaks over a
 threshold u, the highest quantile with enough of them (Davison & Smith 1990). Exceedances closer than twice the
-correlation time are one peak, as they would be one alarm. Peaks beyond u follow a generalised Pareto distribution whose
-shape is at least 0, an exponential: a tail that seems to end is not believed. The level is that of the upper 90 % bound
-of the scale. This assumes that the motion to be watched is like the quiet motion (other loads, temperatures or speeds
-need their own), and that no tail heavier than an exponential begins beyond the largest peak seen.
+correlation time are one peak, as they would be one alarm. Peaks beyond u follow a generalised Pareto distribution, its
+shape ξ by probability-weighted moments. Minutes of quiet motion show a heavy tail badly: the level is that of the upper
+95 % bound of ξ, but of ξ = 0, an exponential, at least, because a tail that seems to end is not believed; and of the
+upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times higher again: the scale
+of the residual differs from day to day. What remains to assume: the motion to be watched is like the quiet motion
+(other loads, temperatures or speeds need their own), its residual has a scale at most SCALE_MARGIN times as large, and
+no heavier tail begins beyond the largest peak seen.
+
+The allowed rate is one on average over bands, from five minutes of quiet motion on. Single bands of a heavy tail
+(Student's with five degrees of freedom) exceed it: the worst of 40 by 3.5 times after five minutes, by 1.3 times after
+thirty, at a scale SCALE_MARGIN times as large; after two minutes the average can, too (docs/evidence/contact.md).
 """
 
 from __future__ import annotations
@@ -43,9 +50,12 @@ from ident.prediction import measured_torque, predict_torque
 DRIVERS = ("constant", "torque", "speed", "acceleration")  #: Of the residual's scale
 PREDICTED_SHARE = 0.95  #: Share of quiet rows inside the band
 PEAK_QUANTILES = (0.99, 0.98, 0.97, 0.95, 0.9)  #: u, the first with enough peaks
-ENOUGH_PEAKS = 30
+ENOUGH_PEAKS = 100  #: With fewer, the shape of a tail like Student's with five degrees of freedom is not seen
 MIN_PEAKS = 10  #: With fewer at the last of them, nothing can be said about the tail
 TAIL_CONFIDENCE = 0.90  #: Of the tail's scale
+SHAPE_SIGMAS = 1.645  #: By which the tail's shape is raised: its upper 95 % bound
+LARGEST_SHAPE = 0.5  #: Of the tail; beyond, peaks have no variance
+SCALE_MARGIN = 1.15  #: How much larger the scale of the residual may be than in the quiet motion
 ALARMS_PER_HOUR = 1.0  #: False alarms of all joints together, in an hour of motion
 FAR_OUT = 3.0  #: Interquartile ranges above the upper quartile (Tukey's "far out")
 
@@ -59,7 +69,7 @@ class Band:
     threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
     correlation_s: FloatArray  #: correlation time of the residual [s], shape (m,)
     quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (m,)
-    alarms_per_hour: float  #: false alarms of all joints together, in an hour of motion
+    alarms_per_hour: float  #: false alarms of all joints together that are allowed in an hour of motion, on average
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +167,9 @@ def prediction_band(
 
     Args:
         calibration, model, conditioning: as for `external_torque`.
-        quiet: the runs; a minute or more, with the motion that is to be watched.
-        alarms_per_hour: false alarms of all joints together, in an hour of motion.
+        quiet: the runs, with the motion that is to be watched; five minutes or more for a heavy tail, and more
+            minutes give lower thresholds.
+        alarms_per_hour: false alarms of all joints together, in an hour of motion: fewer on average; see the top.
 
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
@@ -245,7 +256,9 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
 def alarm_level(
     ratio: FloatArray, time_s: FloatArray, gap_s: float, alarms_per_hour: float, observed_s: float
 ) -> float | None:
-    """Level that a signal exceeds on fewer occasions an hour than given, extrapolated from its peaks; see the top.
+    """Level that a signal exceeds, on average, less often an hour than given, extrapolated from its peaks; see the top.
+
+    The signal may grow by SCALE_MARGIN.
 
     Args:
         ratio: the signal, not negative; NaN where it is not observed, shape (r,).
@@ -266,12 +279,36 @@ def alarm_level(
     if count < MIN_PEAKS:
         return None
     mean = float(peaks.mean())
-    shape = max(0.0, 0.5 * (1.0 - mean**2 / float(peaks.var(ddof=1))))  # by moments (Hosking & Wallis 1987)
+    shape = tail_shape_bound(peaks)
     # The sum of exponential peaks has a gamma distribution: the bound of its scale.
     scale = (1.0 - shape) * mean * count / float(gammaincinv(count, 1.0 - TAIL_CONFIDENCE))
     # An hour of signal has so many times more peaks than alarms are allowed.
     factor = max(1.0, count * 3600.0 / observed_s / alarms_per_hour)
-    return float(start + scale * (np.log(factor) if shape < 1e-9 else (factor**shape - 1.0) / shape))
+    beyond_start = np.log(factor) if shape < 1e-9 else (factor**shape - 1.0) / shape
+    return float(SCALE_MARGIN * (start + scale * beyond_start))
+
+
+def tail_shape_bound(peaks: FloatArray) -> float:
+    """Upper bound of the shape ξ of a generalised Pareto distribution, from 0 to LARGEST_SHAPE.
+
+    ξ is estimated by probability-weighted moments, which a single largest peak moves less than a variance; its
+    standard error is the asymptotic one (Hosking & Wallis 1987, eqs. for k = −ξ).
+
+    Args:
+        peaks: above the threshold, not negative, shape (n,).
+    """
+    count = len(peaks)
+    ordered = np.sort(peaks)
+    mean = float(ordered.mean())
+    # α₁ = E[x (1 − F(x))], unbiased
+    remaining = count - np.arange(1, count + 1)
+    weighted = float(ordered @ remaining) / (count * (count - 1))
+    if mean <= 2.0 * weighted:
+        return 0.0  # equal peaks: no tail
+    shape = 2.0 - mean / (mean - 2.0 * weighted)
+    k = -float(np.clip(shape, -0.4, 0.4))  # where the asymptotic variance holds
+    variance = (1.0 + k) * (2.0 + k) ** 2 * (1.0 + k + 2.0 * k**2) / ((1.0 + 2.0 * k) * (3.0 + 2.0 * k)) / count
+    return float(np.clip(shape + SHAPE_SIGMAS * np.sqrt(variance), 0.0, LARGEST_SHAPE))
 
 
 def _correlation(runs: Sequence[FloatArray]) -> float:

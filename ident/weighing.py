@@ -10,14 +10,17 @@ built from the torques that the last p predicts, until p stays. Beside runs with
 together with p: only the gains are taken from the calibration. Without such runs, χ and c are the calibration's, except
 the friction of the joints, which is found again because it changes with the temperature.
 
-σ has two parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`). The other, S C Sᵀ, is what
-the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ, c).
+σ has three parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`). Another, S C Sᵀ, is what
+the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ, c). The last is the tolerance u_k of the mass
+m_k of each payload that gave the calibration its scale, which C lacks: p moves by S ∂(g, χ, c)/∂m_k u_k, so that it
+adds
+the outer product of this vector with itself. Where that mass was all that was known, this is p u_k/m_k.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -88,13 +91,17 @@ class WeighedBody:
     values: FloatArray  #: NaN for a parameter that the motion does not show, shape (10,) [SI]
     #: From leaving out moves, the calibration taken as exact; NaN likewise, shape (10, 10).
     moves_covariance: FloatArray
-    covariance: FloatArray  #: with the errors of the calibration; NaN likewise, shape (10, 10)
+    #: With the errors of the calibration and the tolerance of its reference masses; NaN likewise, shape (10, 10).
+    covariance: FloatArray
     #: The calibration has its covariance. Otherwise σ adds the errors of the gains by size, because one weight sets
     #: their common scale, and lacks those of the robot's parameters and of the effects.
     complete: bool
     moves: int  #: separate moves behind σ
     error: RelativeError  #: ‖ρ‖/‖Y‖ with the body in the model, on the runs that carried it [%]
     scale: Scale  #: the equations
+    #: The part of `covariance` that is the tolerance of the masses that the calibration was made with; NaN likewise,
+    #: shape (10, 10).
+    reference_covariance: FloatArray = field(default_factory=lambda: np.zeros((10, 10)))
 
     @property
     def std(self) -> FloatArray:
@@ -110,6 +117,11 @@ class WeighedBody:
     def mass_std_kg(self) -> float:
         """σ of m [kg]."""
         return float(self.std[-1])
+
+    @property
+    def mass_reference_std_kg(self) -> float:
+        """Share of σ of m that is the tolerance of the reference masses [kg]; 0 where none is declared."""
+        return float(np.sqrt(self.reference_covariance[-1, -1]))
 
     @property
     def centre_m(self) -> tuple[FloatArray, FloatArray]:
@@ -296,14 +308,18 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     on_body = given.loaded
     regressor = np.concatenate((rows.regressor, rows.effects), axis=1)
     predicted = np.einsum("jpr,p->jr", regressor[:, :, on_body], found)
+    of_calibration = _of_calibration(calibration, gains, slope, names)
+    of_reference = _of_reference_mass(calibration, body, slope, names)
+    unseen_pair = unseen + unseen[:, None]
     return WeighedBody(
         values=body + unseen,
-        moves_covariance=of_moves + unseen + unseen[:, None],
-        covariance=of_moves + _of_calibration(calibration, gains, slope, names) + unseen + unseen[:, None],
+        moves_covariance=of_moves + unseen_pair,
+        covariance=of_moves + of_calibration + of_reference + unseen_pair,
         complete=calibration.covariance_factor is not None,
         moves=len(system.clusters),
         error=relative_error(rows.torque(gains, on_body), predicted, rows.use[:, on_body]),
         scale=Scale(model, unknowns, weight, columns[:, unknowns].T @ columns[:, unknowns], given.bare > 0),
+        reference_covariance=of_reference + unseen_pair,
     )
 
 
@@ -339,6 +355,13 @@ def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArr
         size = np.abs(slope[:, :count]) @ [gain.std for gain in calibration.gains]
         together = np.sign(slope[:, :count] @ gains) * size
         return np.outer(together, together)
+    used = _slope_to_calibration(calibration, slope, held)
+    return np.asarray(used @ covariance @ used.T)
+
+
+def _slope_to_calibration(calibration: Calibration, slope: FloatArray, held: Sequence[str]) -> FloatArray:
+    """∂p/∂(gains, parameters of the calibration), shape (10, n + p), from that to gains and held columns."""
+    count = len(calibration.gains)
     place = {name: count + index for index, name in enumerate(held)}
     used = np.zeros((len(slope), count + len(calibration.parameters)))
     used[:, :count] = slope[:, :count]
@@ -346,7 +369,34 @@ def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArr
         column = place.get(parameter.name, place.get(parameter.name.split()[0]))
         if column is not None:
             used[:, index] = slope[:, column]
-    return np.asarray(used @ covariance @ used.T)
+    return used
+
+
+def _of_reference_mass(
+    calibration: Calibration, body: FloatArray, slope: FloatArray, held: Sequence[str]
+) -> FloatArray:
+    """Covariance of the ten that comes from the tolerance of the calibration's reference masses, shape (10, 10).
+
+    Args:
+        calibration: with the derivatives of its gains and parameters to these masses. Without those of the parameters,
+            the body is taken in proportion to the mass, as it is where nothing else is known of that payload.
+        body: the ten, shape (10,).
+        slope: ∂p/∂(g, held parameters), shape (10, n + h).
+        held: names of the columns held.
+    """
+    out = np.zeros((len(slope), len(slope)))
+    used = _slope_to_calibration(calibration, slope, held)
+    for reference in calibration.payload_mass:
+        if reference.tolerance_kg == 0.0:
+            continue
+        if len(reference.parameters_per_kg) == len(calibration.parameters):
+            gains_per_kg = [gain.per_kg for gain in reference.gains]
+            shift = used @ np.concatenate((gains_per_kg, reference.parameters_per_kg))
+        else:
+            shift = body / reference.mass_kg
+        shift = reference.tolerance_kg * shift
+        out += np.outer(shift, shift)
+    return out
 
 
 @dataclass(frozen=True, slots=True)

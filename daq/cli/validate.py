@@ -132,8 +132,9 @@ def contact_verb(
 ) -> None:
     """Compute the external torque of each axis, its prediction band, and a threshold for contact.
 
-    The threshold gives less than one false alarm in an hour of motion, extrapolated from the quiet logs, or, without
-    any, from the quiet part of the log itself. A payload must be one that the calibration knows.
+    The threshold gives on average less than one false alarm in an hour of motion, extrapolated from the quiet logs, or,
+    without any, from the quiet part of the log itself; five quiet minutes or more are needed.
+    A payload must be one that the calibration knows.
     """
     from daq.report.weighing_views import contact_report, contact_view, draw_contact
     from daq.workflow.weigh import contact_in

@@ -124,6 +124,7 @@ class PayloadMassEntry(StrictModel):
     mass_kg: Annotated[float, Field(gt=0.0, le=_LARGEST)]
     tolerance_kg: _Positive
     gains: tuple[MassInfluenceEntry, ...]
+    parameters_per_kg: tuple[_Number, ...] = ()  # files of earlier versions lack it
 
 
 class GeometryCorrectionEntry(StrictModel):
@@ -187,6 +188,11 @@ class CalibrationBody(StrictModel):
         for one in self.payload_mass:
             if [influence.axis for influence in one.gains] != axes:
                 raise ValueError(f"payload_mass of {one.payload} with an entry for each of the axes {', '.join(axes)}")
+            if one.parameters_per_kg and len(one.parameters_per_kg) != len(self.parameters):
+                raise ValueError(
+                    f"payload_mass of {one.payload} with parameters_per_kg for each of the {len(self.parameters)} "
+                    "parameters"
+                )
         return self
 
 

@@ -70,6 +70,8 @@ class WeighReport(Report):
     part_of_the_fit: list[str]
     declared_kg: Figure
     mass_kg: WeighedValue
+    mass_std_of_reference_kg: Figure
+    """share of σ of the mass that is the tolerance of the payload masses of the calibration; it is in `std`"""
     centre_m: WeighedValues
     centre_in_platform_m: WeighedValues | None
     inertia_about_centre_kg_m2: WeighedValues
@@ -153,6 +155,8 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     if found.declared_kg is not None:
         yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
     within = "moves, gains, robot and effects" if body.complete else "moves and gains"
+    if body.mass_reference_std_kg > 0.0:
+        within += " and with the tolerance of the calibration's payload mass"
     how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
     yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
     if shown:
@@ -236,6 +240,7 @@ def weigh_report(found: Weighed) -> WeighReport:
         cell=found.cell.name,
         part_of_the_fit=found.fitted,
         mass_kg=WeighedValue(value=body.mass_kg, std=body.mass_std_kg),
+        mass_std_of_reference_kg=body.mass_reference_std_kg,
         centre_m=_weighed_values(*body.centre_m),
         centre_in_platform_m=None if platform is None else _weighed_values(*body.centre_in(platform[1])),
         inertia_about_centre_kg_m2=_weighed_values(*body.inertia_kg_m2),
@@ -280,7 +285,7 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
-        "motion like that, all axes together. Standstill is not judged."
+        "motion like that, all axes together, on average and from five quiet minutes on. Standstill is not judged."
     )
     contacts, missing = found.contacts, not_judged(found, cell)
     yield ""

@@ -14,7 +14,7 @@ from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
 from daq.workflow.diagnoses import fixed_gains_of, named_causes, nameplate_of
 from daq.workflow.fit import Fit, Reading, calibration_of, judged, refuse_effects
-from ident.calibration import Calibration, Parameter, Source, factor_of
+from ident.calibration import Calibration, Parameter, PayloadMass, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
 from ident.estimators.comparison import Essential, essential
@@ -190,4 +190,21 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
         names = [parameter.name for parameter in calibration.parameters]
         places = [*range(gains), *(gains + names.index(parameter.name) for parameter in kept)]
         factor = factor_of(np.pad(covariance[np.ix_(places, places)], (0, len(given))))
-    return replace(calibration, parameters=kept + given, condition=condition, covariance_factor=factor)
+    payload_mass = tuple(_of_parameters(one, calibration.parameters, kept, given) for one in calibration.payload_mass)
+    return replace(
+        calibration,
+        parameters=kept + given,
+        condition=condition,
+        covariance_factor=factor,
+        payload_mass=payload_mass,
+    )
+
+
+def _of_parameters(
+    reference: PayloadMass, before: Sequence[Parameter], kept: Sequence[Parameter], given: Sequence[Parameter]
+) -> PayloadMass:
+    """Return a payload's mass with its derivatives of the parameters that a case leaves, and zeros for given ones."""
+    slopes = dict(zip((parameter.name for parameter in before), reference.parameters_per_kg, strict=True))
+    of_kept = tuple(slopes[parameter.name] for parameter in kept)
+    # The columns of a payload are no part of the robot that predicts: what is given of it moves nothing.
+    return replace(reference, parameters_per_kg=(*of_kept, *(0.0 for _ in given)))

@@ -1,4 +1,4 @@
-"""How the gains depend on the mass of a known payload: the derivative of the estimator.
+"""How gains and parameters depend on the mass of a known payload: the derivative of the estimator.
 
 The known payload alone gives the gains their scale, so a wrong mass bends all of them, and where nothing else is known
 of the payload, no residual shows it. With e(g, χ, m) the whitened residual of the motors' equations, J its derivative
@@ -33,11 +33,12 @@ MASS = "m"  #: Its name among LINK_PARAMETERS
 
 @dataclass(frozen=True, slots=True)
 class MassResponse:
-    """Change of each gain with the mass of one payload."""
+    """Change of each gain and each parameter with the mass of one payload."""
 
     payload: str  #: name of the body; in several mountings it is the same body
     mass_kg: float  #: as it was taken for known
     gain_per_kg: FloatArray  #: dg/dm of each motor [Nm at the joint per A and kg], shape (m,)
+    parameters_per_kg: FloatArray  #: d(χ, χ_uL)/dm of each parameter of the estimate [its unit per kg], shape (p,)
 
 
 def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ...]:
@@ -73,10 +74,13 @@ def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ..
     else:
         extended = _with_columns(system, [column for _, column in known])
         shifts = _responses(extended, estimate, len(known))
-    return tuple(
-        MassResponse(name, system.payloads[bodies[name][0]].known[MASS], shifts[: system.axis_count, number])
-        for number, (name, _) in enumerate(known)
-    )
+    responses = []
+    for number, (name, _) in enumerate(known):
+        mass_kg = system.payloads[bodies[name][0]].known[MASS]
+        gain_per_kg = shifts[: system.axis_count, number]
+        parameters_per_kg = shifts[system.axis_count :, number]
+        responses.append(MassResponse(name, mass_kg, gain_per_kg, parameters_per_kg))
+    return tuple(responses)
 
 
 MotorColumns = list[tuple[FloatArray, ...]]

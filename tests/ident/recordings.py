@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, factor_of
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, PayloadMass, factor_of
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
@@ -21,6 +21,7 @@ from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
+from ident.estimators.payload_mass import mass_responses
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
@@ -237,8 +238,13 @@ def calibrated(evidence: Evidence) -> Calibration:
         setting = {name: float(value) for name, value in placed.effect.settings.items()}
         effects.append(AcceptedEffect(placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0))
     whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
+    references = []
+    for one in mass_responses(evidence.identification.system, estimate):
+        slopes = one.gain_per_kg.tolist(), one.parameters_per_kg.tolist()
+        references.append(PayloadMass.of(one.payload, one.mass_kg, slopes[0], whole.gains, slopes[1]))
     return replace(
         whole,
+        payload_mass=tuple(references),
         effects=tuple(effects),
         session_began_s=session_began_s(evidence.fit_runs),
         covariance_factor=factor_of(estimate.covariance),

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import signal, stats
 
 from ident.calibration import Calibration, Parameter
-from ident.contact import PREDICTED_SHARE, alarm_level, external_torque, prediction_band
+from ident.contact import PREDICTED_SHARE, SCALE_MARGIN, alarm_level, external_torque, prediction_band
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.errors import DataUnfit
@@ -99,6 +99,22 @@ def test_the_level_is_crossed_less_often_than_allowed(kind: str) -> None:
     often = alarm_level(seen, time_s, 0.1, 60.0, 120.0)
     assert often is not None
     assert often < level
+
+
+def test_a_heavy_tail_has_fewer_alarms_than_allowed_on_average() -> None:
+    """Student's t with five degrees of freedom, later 15 % larger; independent rows have an exact rate."""
+    rng = np.random.default_rng(2001)
+    seconds = 300.0
+    rows_an_hour = 72_000
+    time_s: FloatArray = np.arange(round(seconds / 0.05)) * np.float64(0.05)
+    rates = []
+    for _ in range(30):
+        seen = np.abs(rng.standard_t(5.0, size=len(time_s)))
+        level = alarm_level(seen, time_s, 0.04, 1.0, seconds)
+        assert level is not None
+        rates.append(rows_an_hour * 2.0 * float(stats.t.sf(level / SCALE_MARGIN, 5.0)))
+    assert np.mean(rates) < 1.0
+    assert np.mean(rates) > 0.01  # a level that nothing reaches would find nothing
 
 
 def test_too_little_quiet_motion_gives_no_threshold(

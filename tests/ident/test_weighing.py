@@ -88,6 +88,29 @@ def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     assert np.sqrt(np.abs(share)) == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * float(np.abs(shift).max()))
 
 
+@pytest.mark.parametrize("beside", [0, 1])
+def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_the_body(
+    small_truth: Truth, cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh], beside: int
+) -> None:
+    """The share of σ is the shift of the body with a calibration that took another mass for known."""
+    calibration = cells[0].calibration
+    (reference,) = calibration.payload_mass
+    factor = 1.002
+    tolerance_kg = (factor - 1.0) * reference.mass_kg
+    heavier = weighed_cell(small_truth, 0, mass_factor=factor).calibration
+    shift = weigh_rows(heavier, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
+    tolerant = replace(calibration, payload_mass=(reference.weighed_to(tolerance_kg),))
+    earlier = replace(calibration, payload_mass=(replace(tolerant.payload_mass[0], parameters_per_kg=()),))
+    exact = weigh_rows(calibration, rows[beside])
+    for known in (tolerant, earlier):
+        found = weigh_rows(known, rows[beside])
+        added = found.covariance - exact.covariance
+        assert found.reference_covariance == pytest.approx(added)
+        assert np.sqrt(np.diag(added)) == pytest.approx(np.abs(shift), rel=0.05, abs=0.02 * np.abs(shift).max())
+        assert found.mass_reference_std_kg == pytest.approx(tolerance_kg / reference.mass_kg * exact.mass_kg, rel=0.02)
+    assert exact.mass_reference_std_kg == 0.0
+
+
 def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
     count = len(calibration.gains)
     pairs = zip(calibration.gains, values[:count], strict=True)

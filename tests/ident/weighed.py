@@ -37,14 +37,22 @@ class WeighedCell:
     body: FloatArray  #: its ten parameters
 
 
-def weighed_cell(truth: Truth, seed: int, *, seconds: float = 24.0) -> WeighedCell:
-    """Calibrate a cell with load friction from four runs, then record it with a body that is drawn anew."""
+def weighed_cell(truth: Truth, seed: int, *, seconds: float = 24.0, mass_factor: float = 1.0) -> WeighedCell:
+    """Calibrate a cell with load friction from four runs, then record it with a body that is drawn anew.
+
+    Args:
+        truth: of the robot.
+        seed: of noise, motions and body.
+        seconds: of each run.
+        mass_factor: of the mass that the calibration takes as known, against the true one.
+    """
     rng = np.random.default_rng(seed)
     conditioning = Conditioning(standstill_rad_s=(0.03,) * len(truth.gains))
+    entered = replace(MOUNTED, known={"m": mass_factor * MOUNTED.known["m"]})
     runs = []
     for index in range(4):
         run = noisy_run(truth, f"run{index}", rng, DISC if index % 2 else None, seconds)
-        runs.append(replace(run, payload=MOUNTED if index % 2 else None))
+        runs.append(replace(run, payload=entered if index % 2 else None))
     evidence = gather(identify(truth.model, runs, conditioning), runs)
     calibration = calibrated(with_effects(evidence, (PlacedEffect(LoadFriction(0), AXIS),)))
     body = a_body(rng)

@@ -169,6 +169,7 @@ def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
         inertia_kg_m2=(np.full(6, 0.0123456), np.full(6, 0.00000123)),
         mass_kg=12.34567,
         mass_std_kg=0.00123,
+        mass_reference_std_kg=0.00045,
         complete=True,
         moves=123,
         error=ERROR,

@@ -163,6 +163,12 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     assert [one.name for one in report.parameters] == list(LINK_PARAMETERS)
     assert [one.name for one in report.parameters if one.add is not None] == ["mz"]
     assert [one.name for one in report.parameters if not one.identifiable] == ["mz"]
+    assert "tolerance" not in text
+    assert report.mass_std_of_reference_kg == 0.0
+    reference = np.full((10, 10), 1e-6)
+    tolerant = replace(found, body=replace(body, reference_covariance=reference))
+    assert "with the tolerance of the calibration's payload mass" in " ".join(_text(weighed_view(tolerant)).split())
+    assert weigh_report(tolerant).mass_std_of_reference_kg == pytest.approx(0.001)
     nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
 
