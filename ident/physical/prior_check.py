@@ -19,6 +19,8 @@ from ident.arrays import FloatArray
 LEVEL = 0.01
 """Probability with which a right prior is called wrong, for the three tests together."""
 
+_VISIBLE = 1e-12  #: Share of a link's rows that other parameters leave, below which it is rounding
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorCheck:
@@ -27,7 +29,7 @@ class PriorCheck:
     chi_square: float  #: misfit of data and prior
     degrees_of_freedom: int  #: its mean where the prior is right
     mass_ratio: float  #: how heavy all links are, by the data, relative to the prior
-    mass_ratio_std: float  #: its σ, the prior's tolerance included
+    mass_ratio_std: float  #: its σ, the prior's tolerance included; infinite where the data do not show it
     link_ratios: FloatArray  #: the same of each link, shape (n,)
     link_ratio_stds: FloatArray  #: shape (n,); infinite for a link that the data do not show
 
@@ -73,20 +75,20 @@ def check_prior(matrix: FloatArray, right: FloatArray, links: int, tolerance: fl
         # E = 1: P, and with it all ten parameters, is 1 + t times the prior's.
         heavier[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
     seen = heavier - basis @ (basis.T @ heavier)
-    all_links = seen.sum(axis=1)
+    seen = np.column_stack((seen, seen.sum(axis=1)))  # the last one is of all links together
     square = np.sum(seen**2, axis=0)
-    visible = square > 1e-12 * np.sum(heavier**2, axis=0)
+    visible = square > _VISIBLE * 4.0 / tolerance**2
     square = np.where(visible, square, np.inf)
-    shifts = np.where(visible, -(seen.T @ left) / square, 0.0)
-    stds = np.where(visible, 1.0 / np.sqrt(square), np.inf)
-    size = float(all_links @ all_links)
+    ratios = 1.0 - (seen.T @ left) / square
+    stds = np.full(links + 1, np.inf)
+    stds[visible] = 1.0 / np.sqrt(square[visible])
     return PriorCheck(
         chi_square=float(left @ left),
         degrees_of_freedom=matrix.shape[0] - matrix.shape[1],
-        mass_ratio=1.0 - float(all_links @ left) / size,
-        mass_ratio_std=1.0 / np.sqrt(size),
-        link_ratios=1.0 + shifts,
-        link_ratio_stds=stds,
+        mass_ratio=float(ratios[-1]),
+        mass_ratio_std=float(stds[-1]),
+        link_ratios=ratios[:-1],
+        link_ratio_stds=stds[:-1],
     )
 
 

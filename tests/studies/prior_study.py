@@ -37,11 +37,12 @@ from ident.model.bodies import Payload
 from ident.model.model import JOINT_COLUMNS, Model
 from ident.physical.full_parameters import Basis, FullParameters, LinkPrior, full_parameters
 from ident.physical.physical import urdf_links
-from tests.studies.direct_cell import run_of
-from tests.studies.fingerprint import digest, digest_of_source, made_once
+from tests.studies.direct_cell import MOVING, RawRun, run_of
+from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, made_once
 from tests.studies.followed_cell import follow, point_to_point
 from tests.studies.loop_noise import NORMAL_95
 from tests.studies.output import print_line
+from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.real_runs import data_folder, tx40
 
 OUT = Path("out/prior-study")
@@ -72,11 +73,25 @@ ROBOTS = (
 )
 
 
-def simulated_runs(robot: PriorRobot, seed: int) -> tuple[Cell, CellSpec, list[Run]]:
-    """Return a cell, its truth and its four runs."""
+def kept_runs(robot: PriorRobot, seed: int, out: Path) -> tuple[Cell, CellSpec, list[Run]]:
+    """Return a cell, its truth without load and its four runs, which are simulated unless they are there."""
     cell = load_cell(shipped_configurations() / "cells" / f"{robot.cell}.yaml")
-    body = cell.payloads[0]
     spec = load_simulation(shipped_simulation(robot.simulation))
+    path = out / f"{robot.name}-{seed}.npz"
+    source = digest_of_source("tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell"))
+    fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, spec.effects)
+    if not is_finished(path, fingerprint):
+        out.mkdir(parents=True, exist_ok=True)
+        write_runs(path, simulated_runs(robot, cell, seed))
+        finish(path, fingerprint)
+    body = cell.payloads[0]
+    raw = read_runs(path, lambda name: Payload(name, body.mounting, {"m": body.mass_kg}))
+    return cell, spec, [run_of(one, cell) for one in raw]
+
+
+def simulated_runs(robot: PriorRobot, cell: Cell, seed: int) -> list[RawRun]:
+    """Simulate four runs, every other one with the cell's first payload."""
+    body = cell.payloads[0]
     runs = []
     for number, mounted in enumerate((None, body.name, None, body.name)):
         spec = replace(load_simulation(shipped_simulation(robot.simulation), mounted), seed=1000 * seed + number)
@@ -85,9 +100,8 @@ def simulated_runs(robot: PriorRobot, seed: int) -> tuple[Cell, CellSpec, list[R
         payload = None
         if mounted is not None:
             payload = Payload(body.name, body.mounting, {"m": body.mass_kg})
-        raw = follow(cell, spec, demand, f"run-{number}", payload, BETWEEN_S * number)
-        runs.append(run_of(raw, cell))
-    return cell, spec, runs
+        runs.append(follow(cell, spec, demand, f"run-{number}", payload, BETWEEN_S * number))
+    return runs
 
 
 def fitted(cell: Cell, runs: Sequence[Run]) -> Identification:
@@ -132,9 +146,9 @@ def priors(links: FloatArray, tolerance: float, rng: np.random.Generator) -> dic
     return {kind: LinkPrior(scale * right, tolerance) for kind, scale in scales.items()}
 
 
-def study(robot: PriorRobot, seed: int) -> dict[str, Any]:
+def study(robot: PriorRobot, seed: int, out: Path) -> dict[str, Any]:
     """Return what one cell gives."""
-    cell, spec, runs = simulated_runs(robot, seed)
+    cell, spec, runs = kept_runs(robot, seed, out)
     found = fitted(cell, runs)
     estimate = found.estimate
     gains = np.array([axis.gain_nm_per_a for axis in spec.axes])
@@ -189,12 +203,10 @@ def case(
 
 def kept(robot: PriorRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
     """Return the figures of a cell, which are made unless they are there."""
-    sources = [
-        digest_of_source(module)
-        for module in ("tests.studies.followed_cell", "ident.estimators.identify", "ident.physical.full_parameters")
-    ]
+    modules = ("tests.studies.followed_cell", "ident.estimators.identify", "ident.physical.full_parameters")
+    sources = [digest_of_source(module) for module in modules]
     fingerprint = digest(robot, seed, DURATION_S, TOLERANCES, OFF, sources)
-    return made_once(out, f"{robot.name}-{seed}", fingerprint, lambda _: study(robot, seed))
+    return made_once(out, f"{robot.name}-{seed}", fingerprint, lambda _: study(robot, seed, out / "runs"))
 
 
 def coverage(z: Sequence[Sequence[float]]) -> str:
