@@ -14,6 +14,7 @@ from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
 from ident.model.bodies import LOADED
+from ident.physical.full_set import FullSet
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.evidence import Evidence
@@ -230,6 +231,8 @@ class Calibration:
     payload_mass: tuple[PayloadMass, ...] = ()
     #: Of a robot with more encoders than degrees of freedom; None for others, and in calibrations of earlier versions.
     encoder_misfit: EncoderMisfit | None = None
+    #: All standard parameters under a prior; None where none was asked for, and in calibrations of earlier versions.
+    full_parameters: FullSet | None = None
 
     @property
     def places(self) -> tuple[str, ...]:

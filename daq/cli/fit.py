@@ -32,6 +32,7 @@ from daq.cli.verb import (
     print_json,
     taking,
 )
+from daq.environment import require_packages
 from daq.errors import OutputFailed, UsageError, writing
 from daq.files import replace_file
 from daq.workflow.choices import Known
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from daq.workflow.cases import CaseFit
     from daq.workflow.fit import Fit
     from ident.calibration import Calibration
+    from ident.physical.full_set import FullSet
 
 CALIBRATION = "drivegain-calibration"  #: Format of the calibrations that `fit` writes
 TABLES = "drivegain-fit-tables"  #: Format of its page of tables
@@ -139,6 +141,24 @@ class FitRequest(LogsRequest):
         ),
     ] = False
     report: Annotated[Path | None, output_option("--report", "Folder for report.html, the certificate.")] = None
+    prior: Annotated[
+        Path | None,
+        typer.Option("--prior", help="URDF with the inertias of the CAD model: also find every single parameter."),
+    ] = None
+    prior_tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--prior-tolerance",
+            min=0.01,
+            max=0.5,
+            help="How far its masses and inertias may be off, one relative σ (0.1); alone: of the cell's URDF.",
+        ),
+    ] = None
+
+    @property
+    def wants_full(self) -> bool:
+        """Whether all standard parameters are to be found."""
+        return self.prior is not None or self.prior_tolerance is not None
 
 
 @taking(FitRequest)
@@ -153,10 +173,15 @@ def fit_verb(request: FitRequest) -> None:
     if request.cases is not None:
         _fit_cases(request, request.cases)
         return
+    at_most_one(essential=request.essential, prior=request.prior or request.prior_tolerance)
     request.check_places(request.report)
+    if request.wants_full:
+        require_packages("full parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
+        if request.wants_full:
+            calibration = replace(calibration, full_parameters=_full_set(request, found.fitted))
     refused = geometry_refusal(calibration.diagnoses)
     if refused is not None:  # nothing is written, and no gains are shown that mean nothing
         if request.json:
@@ -207,6 +232,20 @@ def _fit(request: FitRequest) -> CaseFit:
     return replace(essential_fit(found.fitted, request.essential), payloads=found.payloads)
 
 
+def _full_set(request: FitRequest, fitted: Fit) -> FullSet:
+    """Find all standard parameters under the prior that is asked for."""
+
+    from daq.config.yaml_file import read_yaml_bytes
+    from daq.workflow.full_parameters import DEFAULT_TOLERANCE, OF_CELL, full_set
+
+    urdf = fitted.cell.urdf
+    name = OF_CELL
+    if request.prior is not None:
+        urdf = read_yaml_bytes(request.prior).decode("utf-8", errors="replace")
+        name = request.prior.name
+    return full_set(fitted, urdf, name, request.prior_tolerance or DEFAULT_TOLERANCE)
+
+
 def _fit_cases(request: FitRequest, folder: Path) -> None:
     """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
 
@@ -220,6 +259,7 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         method=request.method,
         known=request.known is not Known.MASS,  # every case has its own
         gains=request.gains_fixed,  # likewise
+        prior=request.wants_full,
         out=request.out,
         report=request.report,
         pictures=request.pictures,

@@ -44,6 +44,7 @@ from ident.calibration import (
 )
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
+from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 
 _LARGEST = 1e30  #: Size of a number, in any unit: products of three of them are still finite
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
@@ -154,6 +155,43 @@ class EncoderMisfitEntry(StrictModel):
     late_encoders: str = ""  # likewise
 
 
+class FullParameterEntry(StrictModel):
+    """One standard parameter under a prior."""
+
+    name: str
+    value: _Number
+    std: _Positive
+    unit: str
+    basis: Literal["data", "prior"]
+    prior_share: Annotated[float, Field(ge=0.0, le=1.0)]
+    prior: _Number | None
+    prior_std: _Positive | None
+
+
+class GainWithPriorEntry(StrictModel):
+    """What the prior would make of a gain."""
+
+    axis: str
+    value: _Number
+    std: _Positive
+
+
+class FullSetEntry(StrictModel):
+    """All standard parameters under a prior on the links."""
+
+    urdf: str
+    urdf_sha256: str
+    tolerance: _Positive
+    parameters: tuple[FullParameterEntry, ...]
+    gains: tuple[GainWithPriorEntry, ...]
+    bounded: bool
+    chi_square: _Positive
+    degrees_of_freedom: Annotated[int, Field(ge=0, le=10**6)]
+    mass_ratio: _Number | None
+    mass_ratio_std: _Positive | None
+    contradictions: tuple[str, ...]
+
+
 class CalibrationBody(StrictModel):
     """Schema of a calibration, without the envelope of a file; its keys are in the order of `Calibration`."""
 
@@ -181,6 +219,7 @@ class CalibrationBody(StrictModel):
     passive_joints: tuple[str, ...] = ()
     payload_mass: tuple[PayloadMassEntry, ...] = ()
     encoder_misfit: EncoderMisfitEntry | None = None
+    full_parameters: FullSetEntry | None = None
 
     @model_validator(mode="after")
     def _check_axes_of_payload_mass(self) -> Self:
@@ -215,6 +254,9 @@ _CLASSES: dict[type, type] = {
     PayloadMassEntry: PayloadMass,
     GeometryCorrectionEntry: GeometryCorrection,
     EncoderMisfitEntry: EncoderMisfit,
+    FullParameterEntry: FullParameter,
+    GainWithPriorEntry: GainWithPrior,
+    FullSetEntry: FullSet,
 }
 
 

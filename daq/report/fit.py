@@ -17,6 +17,7 @@ from daq.errors import counted
 from daq.report import paper_tables
 from daq.report.document import Figure, Report
 from daq.report.effect_names import size_text
+from daq.report.full_parameters import full_parameter_view
 from daq.report.gains import (
     OwnTorque,
     gain_table,
@@ -202,6 +203,8 @@ def fit_view(
         for table in comparison_tables(comparison, axes):
             yield ""
             yield table
+    if calibration.full_parameters is not None:
+        yield from full_parameter_view(calibration, calibration.full_parameters)
     if found.essential is not None:
         removed = ", ".join(step.name for step in found.essential.removed) or "none"
         yield f"{len(found.essential.system.columns)} essential parameters; removed: {removed}"

@@ -15,7 +15,7 @@ from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from daq.workflow.validate import CORRECTIONS
 from ident.calibration import Calibration
 from ident.model.bodies import LOADED
-from ident.physical.physical import MARGIN
+from ident.physical.consistency import MARGIN
 
 _SHOWN_SHIFTS = 5
 

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import linalg
 
-from ident.arrays import FloatArray, IntArray
-from ident.errors import IdentificationError, ModelError
+from ident.arrays import FloatArray
+from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
 from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.model.urdf import read_urdf
+from ident.physical.consistency import (
+    MARGIN,
+    Consistency,
+    NotPhysical,
+    consistency_of,
+    relative_to_prior,
+    solve_programme,
+)
 
-MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 _ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search
 _SCALAR_ROOM = 2e-7
 """Lower bound of drive-chain parameters that may not be negative [share of the whole torque]: above the solver's
@@ -30,17 +35,6 @@ _TRACE = 1e-8
 _RIDGE = 1e-6
 """Weight of the drive-chain parameters in the second: decides between those that the torque cannot distinguish."""
 _INVISIBLE = 1e-9  #: Change of the relative torque below which a unit step leaves the torque unchanged
-_ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
-"""Settings of Clarabel, tried in turn: some programmes end in a numerical error with the first."""
-
-
-class NotPhysical(IdentificationError):
-    """No consistent set of parameters was found, or it does not pass its own test."""
-
-    def __init__(self, reason: str, evidence: str) -> None:
-        super().__init__(f"{reason}: {evidence}")
-        self.reason = reason
-        self.evidence = evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +42,9 @@ class Programme:
     """Data of both programmes for c standard parameters, n links and b base parameters."""
 
     factors: FloatArray  #: L of each link's prior, shape (n, 4, 4)
-    link_columns: IntArray  #: indices of each link's ten parameters, shape (n, 10)
-    scalars: IntArray  #: indices of the other parameters, shape (s,)
-    scales: FloatArray  #: value of each of these that makes the whole torque, shape (s,)
+    consistency: Consistency  #: conditions on them and on the other parameters
     grouping: FloatArray  #: base parameters = grouping @ standard parameters, shape (b, c)
     triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
-    positive: tuple[int, ...]  #: parameters that may not be negative
-    #: For each set of motors that turn with the same joints: parameters, and the contribution of each to the symmetric
-    #: matrix that must be positive semidefinite, shape (p, k, k).
-    dissipative: tuple[tuple[tuple[int, ...], FloatArray], ...]
 
     def nearest(self, base: FloatArray) -> FloatArray:
         """Find the consistent standard parameters whose torque is nearest to that of ``base``, shape (b,) → (c,).
@@ -67,19 +55,19 @@ class Programme:
         import cvxpy as cp  # noqa: PLC0415 - an optional extra, and a second of start-up
 
         links = [cp.Variable((4, 4), symmetric=True) for _ in self.factors]
-        scalars = cp.Variable(len(self.scalars))
-        constraints = self._consistent(cp, links, scalars, _ROOM * MARGIN, _SCALAR_ROOM)
-        place = np.zeros((self.grouping.shape[1], len(self.scalars)))
-        place[self.scalars, np.arange(len(self.scalars))] = self.scales
+        scalars = cp.Variable(len(self.consistency.scalars))
+        constraints = self.consistency.constraints(cp, links, scalars, _ROOM * MARGIN, _SCALAR_ROOM)
+        place = np.zeros((self.grouping.shape[1], len(self.consistency.scalars)))
+        place[self.consistency.scalars, np.arange(len(self.consistency.scalars))] = self.consistency.scales
         torque_of = self.triangle @ self.grouping
         torque = (torque_of @ place) @ scalars
-        for link, factor, columns in zip(links, self.factors, self.link_columns, strict=True):
+        for link, factor, columns in zip(links, self.factors, self.consistency.link_columns, strict=True):
             # Standard parameters of the link per entry of Q, row by row.
             units = [link_parameters(factor @ unit.reshape(4, 4) @ factor.T) for unit in np.eye(16)]
             torque = torque + (torque_of[:, columns] @ np.column_stack(units)) @ cp.vec(link, order="C")
         distance = cp.norm2(torque - self.triangle @ base)
         size = sum(cp.trace(link) for link in links)
-        _solve(cp, cp.Minimize(distance + _TRACE * size), constraints, (*links, scalars))
+        solve_programme(cp, cp.Minimize(distance + _TRACE * size), constraints, (*links, scalars))
         return self._standard(np.array([link.value for link in links]), scalars.value)
 
     def closest_to_prior(
@@ -113,66 +101,27 @@ class Programme:
         drive = moved[16 * count :]
         divergence = sum(cp.trace(link) - cp.log_det(link) for link in found)
         objective = cp.Minimize(divergence + _RIDGE * cp.sum_squares(drive))
-        constraints = self._consistent(cp, found, drive, MARGIN, 0.5 * _SCALAR_ROOM)
+        constraints = self.consistency.constraints(cp, found, drive, MARGIN, 0.5 * _SCALAR_ROOM)
         effect = self.triangle @ self.grouping @ directions @ rotation
         if np.linalg.norm(effect) > _INVISIBLE:
             apart = self.triangle @ (self.grouping @ start - base)
             constraints.append(cp.norm2(apart + effect @ step) <= farthest)
-        _solve(cp, objective, constraints, (step,))
+        solve_programme(cp, objective, constraints, (step,))
         change = steps @ step.value
         return start + self._standard(change[: 16 * count].reshape(-1, 4, 4), change[16 * count :])
 
-    def _consistent(self, cp: Any, links: list[Any], scalars: Any, margin: float, room: float) -> list[Any]:
-        """Constraints on the links relative to their priors, and on the scaled other parameters."""
-        constraints = [link >> margin * np.eye(4) for link in links]
-        where = {int(column): number for number, column in enumerate(self.scalars)}
-        if self.positive:
-            constraints.append(scalars[[where[column] for column in self.positive]] >= room)
-        for columns, parts in self.dissipative:
-            size = np.array([self.scales[where[column]] for column in columns])
-            # In the scales of its diagonal, like everything else.
-            unit = np.sqrt([size[np.argmax(parts[:, k, k])] for k in range(parts.shape[1])])
-            matrix = sum(
-                scalars[where[column]] * (part * scale / np.outer(unit, unit))
-                for column, part, scale in zip(columns, parts, size, strict=True)
-            )
-            constraints.append(matrix >> room * np.eye(len(unit)))
-        return constraints
-
     def _scaled(self, standard: FloatArray) -> FloatArray:
         """Q of every link, row by row, and the scaled other parameters, shape (16 n + s,)."""
-        links = relative_to_prior(self.factors, standard[self.link_columns])
-        return np.concatenate((links.ravel(), standard[self.scalars] / self.scales))
+        links = relative_to_prior(self.factors, standard[self.consistency.link_columns])
+        return np.concatenate((links.ravel(), standard[self.consistency.scalars] / self.consistency.scales))
 
     def _standard(self, links: FloatArray, scalars: FloatArray) -> FloatArray:
         """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters, shape (c,)."""
         standard = np.zeros(self.grouping.shape[1])
-        standard[self.scalars] = self.scales * scalars
-        for link, factor, columns in zip(links, self.factors, self.link_columns, strict=True):
+        standard[self.consistency.scalars] = self.consistency.scales * scalars
+        for link, factor, columns in zip(links, self.factors, self.consistency.link_columns, strict=True):
             standard[columns] = link_parameters(factor @ link @ factor.T)
         return standard
-
-
-def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
-    """Q = L⁻¹ P L⁻ᵀ of links, shapes (n, 4, 4) and (n, 10) → (n, 4, 4)."""
-    inverse = np.linalg.inv(factors)
-    return np.array([inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inverse, links, strict=True)])
-
-
-def _solve(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]) -> None:
-    problem = cp.Problem(objective, constraints)
-    message = ""
-    for settings in _ATTEMPTS:
-        with warnings.catch_warnings():
-            # The accuracy that the solver warns about is checked on its result by ident.physical.
-            warnings.simplefilter("ignore")
-            try:
-                problem.solve(solver=cp.CLARABEL, **settings)
-            except cp.SolverError as error:
-                message = str(error)
-        if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(one.value is not None for one in unknowns):
-            return
-    raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {message}".strip())
 
 
 DEFAULT_MASS_KG = 1.0  #: Mass of a link without one in the URDF
@@ -339,13 +288,7 @@ def physical_parameters(
 ) -> PhysicalParameters:
     """Find physically consistent standard parameters that predict the torque of base parameters.
 
-    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry friction fs and fsm,
-    and the own parameters of motors that turn with several joints (Iam, fvm), are not negative; the kinetic energy of
-    the rotors and the power lost to viscous friction are not negative in any motion, that is
-
-        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq. 25),
-
-    which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free. The first programme finds
+    Consistent is what `ident.physical.consistency` says. The first programme finds
     the torque nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second finds, of
     all sets with this torque, the one nearest to the prior.
 
@@ -385,7 +328,7 @@ def physical_parameters(
     if exact:
         # The leading parameters take the rest of the solver's tolerance.
         standard[leading] += values - base.grouping @ standard
-    for column in programme.positive:
+    for column in programme.consistency.positive:
         standard[column] = max(standard[column], 0.0)
     found = PhysicalParameters(
         model=model,
@@ -416,47 +359,12 @@ def _programme(
     prior: InertiaPrior,
     other_friction: frozenset[int],
 ) -> Programme:
-    index = {column.name: number for number, column in enumerate(model.columns)}
-    link_columns = model.link_columns
-    scalars = np.setdiff1d(np.arange(len(index)), link_columns)
+    scalars = np.setdiff1d(np.arange(len(model.columns)), model.link_columns)
     norms = np.linalg.norm(rows[:, scalars], axis=0)
-    coupled = model.drive_train.coupled
-    own_friction = [axis for axis in range(model.robot.joint_count) if axis not in other_friction]
-    positive = [index[f"fs{axis + 1}"] for axis in own_friction]
-    positive += [index[f"Iam{motor + 1}"] for motor in coupled]
-    positive += [index[f"{name}{motor + 1}"] for motor in coupled if motor in own_friction for name in ("fvm", "fsm")]
-    dissipative = []
-    for joints in _turned_together(model):
-        motors = [motor for motor in coupled if np.any(model.drive_train.direction[motor, list(joints)])]
-        for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
-            if single == "fv" and other_friction.intersection(joints):
-                continue
-            names = [f"{single}{joint + 1}" for joint in joints] + [f"{shared}{motor + 1}" for motor in motors]
-            if len(joints) == 1:
-                positive.append(index[names[0]])
-            else:
-                # Contribution of each joint's, then each motor's parameter to the matrix over these joints, (p, k, k).
-                turned = [model.drive_train.direction[motor, list(joints)] for motor in motors]
-                shares = [np.diag(unit) for unit in np.eye(len(joints))]
-                shares += [np.outer(r, r) - np.diag(r**2) for r in turned]
-                dissipative.append((tuple(index[name] for name in names), np.array(shares)))
+    scales = 1.0 / np.where(norms > 0.0, norms, 1.0)  # value of each that makes the whole torque
     return Programme(
         factors=np.array([np.linalg.cholesky(pseudo_inertia(link)) for link in prior.links]),
-        link_columns=link_columns,
-        scalars=scalars,
-        scales=1.0 / np.where(norms > 0.0, norms, 1.0),
+        consistency=consistency_of(model, scales, other_friction),
         grouping=base.grouping,
         triangle=triangle,
-        positive=tuple(positive),
-        dissipative=tuple(dissipative),
     )
-
-
-def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
-    """Group joints that share motors."""
-    groups: list[set[int]] = [{joint} for joint in range(model.robot.joint_count)]
-    for motor in model.drive_train.coupled:
-        turned = set(np.flatnonzero(model.drive_train.direction[motor]).tolist())
-        touched = [group for group in groups if group & turned]
-        groups = [group for group in groups if not group & turned] + [set().union(*touched)]
-    return tuple(tuple(sorted(group)) for group in groups)

@@ -17,11 +17,10 @@ from ident.model.bodies import body_of, link_parameters, pseudo_inertia
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
+from ident.physical.consistency import MARGIN, NotPhysical
 from ident.physical.physical import (
     DEFAULT_MASS_KG,
-    MARGIN,
     SLACK,
-    NotPhysical,
     PhysicalParameters,
     inertia_prior,
     physical_parameters,

@@ -1,0 +1,165 @@
+"""Full parameters of a fitted robot under a prior: the inertias of a URDF, and how far they may be off."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+
+import numpy as np
+
+from daq.config.cell import Cell
+from daq.errors import ConfigurationInconsistent, UsageError
+from daq.workflow.fit import Fit
+from ident.arrays import FloatArray
+from ident.effects.effect import Property
+from ident.errors import ModelError
+from ident.model.robot import Joint
+from ident.model.urdf import read_urdf
+from ident.physical.full_parameters import FullParameters, LinkPrior, full_parameters
+from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
+from ident.physical.prior_check import PriorCheck
+
+DEFAULT_TOLERANCE = 0.1  #: Of a CAD model: masses and second moments within 10 %, one standard deviation
+OF_CELL = "the URDF of the cell"
+_SAME_PLACE = 1e-6  #: Largest difference of two statements of one joint's place [m, or of a unit vector]
+
+
+def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
+    """Find all standard parameters of a fit's robot.
+
+    Args:
+        fitted: with its declared effects.
+        urdf: text of the URDF with the prior's inertias.
+        name: of it, in messages.
+        tolerance: one relative standard deviation of masses and second moments.
+
+    Raises:
+        UsageError: the robot has a closed chain, or the URDF has no inertia for one of its links.
+        ConfigurationInconsistent: the URDF is of another robot.
+        NotPhysical: no possible robot was found.
+    """
+    cell = fitted.cell
+    links = _links_of(cell, fitted.identification.model.robot.joints, urdf, name)
+    prior = LinkPrior(links, tolerance)
+    final = fitted.final
+    effects = fitted.steps[-1].after.effects if fitted.steps else ()
+    friction = frozenset(one.axis for one in effects if one.effect.declares is Property.ODD_IN_VELOCITY)
+    try:
+        found = full_parameters(final.system, final.estimate, prior, friction)
+    except ModelError as error:
+        raise UsageError(
+            "--prior",
+            found=str(error),
+            expected="a serial robot with all of its base parameters",
+            remedy="fit without --prior and --prior-tolerance",
+        ) from error
+    of_links = np.full(len(found.names), np.nan)
+    of_links[final.model.link_columns] = links
+    gains: tuple[GainWithPrior, ...] = ()
+    if not final.estimate.gains_fixed:
+        gains = tuple(
+            GainWithPrior(axis, float(value), float(std))
+            for axis, value, std in zip(cell.axis_names, found.gains, found.gains_std, strict=True)
+        )
+    check = found.check
+    is_mass_seen = bool(np.isfinite(check.mass_ratio_std))
+    joints = [joint.name for joint in final.model.robot.joints]
+    return FullSet(
+        urdf=name,
+        urdf_sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+        tolerance=tolerance,
+        parameters=tuple(_parameters(found, of_links)),
+        gains=gains,
+        bounded=found.bounded,
+        chi_square=check.chi_square,
+        degrees_of_freedom=check.degrees_of_freedom,
+        mass_ratio=check.mass_ratio if is_mass_seen else None,
+        mass_ratio_std=check.mass_ratio_std if is_mass_seen else None,
+        contradictions=tuple(contradictions(check, joints)),
+    )
+
+
+def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
+    """Say why a prior is wrong; nothing where the data agree with it.
+
+    Args:
+        check: by the data.
+        joints: names of the joints that move the links.
+    """
+    if check.is_mass_wrong:
+        size = f"{check.mass_ratio:.2f} ± {check.mass_ratio_std:.2f}"
+        yield f"by the data, the links together weigh {size} times what it says"
+    for link in check.wrong_links:
+        size = f"{check.link_ratios[link]:.2f} ± {check.link_ratio_stds[link]:.2f}"
+        yield f"by the data, the link of joint {joints[link]} weighs {size} times what it says"
+    if check.is_misfit:
+        yield (
+            f"it misses the data by {check.chi_square:.0f}, where its tolerance explains "
+            f"{check.degrees_of_freedom} (χ²)"
+        )
+
+
+def _parameters(found: FullParameters, of_links: FloatArray) -> Iterator[FullParameter]:
+    for number, name in enumerate(found.names):
+        has_prior = bool(np.isfinite(of_links[number]))
+        yield FullParameter(
+            name=name,
+            value=float(found.standard[number]),
+            std=float(found.standard_std[number]),
+            unit=found.units[number],
+            basis=found.basis[number].value,
+            prior_share=float(np.clip(found.prior_share[number], 0.0, 1.0)),
+            prior=float(of_links[number]) if has_prior else None,
+            prior_std=float(found.prior_std[number]) if has_prior else None,
+        )
+
+
+def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> FloatArray:
+    """Links of a prior, shape (n, 10), of a URDF with the joints of a cell."""
+    try:
+        found = read_urdf(urdf)
+    except ModelError as error:
+        raise ConfigurationInconsistent(
+            name, found=str(error), expected="a URDF", remedy="give another file as --prior"
+        ) from error
+    differences = [mine.name for mine, other in zip(joints, found.joints, strict=False) if not _is_same(mine, other)]
+    if len(joints) != len(found.joints):
+        differences = [f"{len(found.joints)} moving joints"]
+    if differences:
+        raise ConfigurationInconsistent(
+            name,
+            found=f"another robot: {', '.join(differences)}",
+            expected=f"the {len(joints)} joints of cell {cell.name!r} at the same places, "
+            f"{', '.join(joint.name for joint in joints)}",
+            remedy="give the URDF of this robot, with the inertias of its CAD model",
+        )
+    without = [
+        joint.name
+        for joint, body in zip(joints, found.bodies, strict=True)
+        if not _is_body(body.mass_kg, body.inertia_kg_m2)
+    ]
+    if without:
+        raise UsageError(
+            name,
+            found=f"no possible inertia for the links of {', '.join(without)}",
+            expected="a positive mass and an inertia with the triangle inequality for each moving link",
+            remedy="give a URDF with the inertias of the CAD model as --prior",
+        )
+    return np.array([body.parameters for body in found.bodies])
+
+
+def _is_same(mine: Joint, other: Joint) -> bool:
+    if mine.kind is not other.kind or mine.parent != other.parent:
+        return False
+    places = (
+        (mine.rotation, other.rotation),
+        (mine.translation_m, other.translation_m),
+        (mine.axis, other.axis),
+    )
+    return all(np.allclose(one, another, rtol=0.0, atol=_SAME_PLACE) for one, another in places)
+
+
+def _is_body(mass_kg: float, inertia_kg_m2: FloatArray) -> bool:
+    """Whether mass and inertia about the centre of mass are those of a body, one that is not flat or thin."""
+    moments = np.linalg.eigvalsh(inertia_kg_m2)
+    return mass_kg > 0.0 and float(moments[0] + moments[1]) > float(moments[2])

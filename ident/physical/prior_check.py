@@ -1,0 +1,97 @@
+"""Whether data contradict a prior: by its misfit as a whole, and by how heavy they find its links.
+
+Rows of data and prior in units of their σ, M x = y, leave a misfit ‖y − M x̂‖² that has the chi-square distribution with
+as many degrees of freedom as there are more rows than unknowns. It is weak against one mistake that all links share:
+30 % too heavy is 1.5 σ for a tolerance of 20 %, one link at a time. A prior whose links all weigh 1 + s times what it
+says adds a column to M, M x − s c = y; s and its σ by least squares are a test of that alone, and so is the same for
+each link.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from ident.arrays import FloatArray
+
+LEVEL = 0.01
+"""Probability with which a right prior is called wrong, for the three tests together."""
+
+_VISIBLE = 1e-12  #: Share of a link's rows that other parameters leave, below which it is rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PriorCheck:
+    """Tests of a prior with n links by data."""
+
+    chi_square: float  #: misfit of data and prior
+    degrees_of_freedom: int  #: its mean where the prior is right
+    mass_ratio: float  #: how heavy all links are, by the data, relative to the prior
+    mass_ratio_std: float  #: its σ, the prior's tolerance included; infinite where the data do not show it
+    link_ratios: FloatArray  #: the same of each link, shape (n,)
+    link_ratio_stds: FloatArray  #: shape (n,); infinite for a link that the data do not show
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether the misfit as a whole is more than chance."""
+        return float(special.chdtrc(self.degrees_of_freedom, self.chi_square)) < LEVEL / 3.0
+
+    @property
+    def is_mass_wrong(self) -> bool:
+        """Whether the data find all links lighter or heavier than the tolerance allows."""
+        return _chance((self.mass_ratio - 1.0) / self.mass_ratio_std) < LEVEL / 3.0
+
+    @property
+    def wrong_links(self) -> tuple[int, ...]:
+        """Links (from 0) that the data find lighter or heavier than the tolerance allows."""
+        sigmas = (self.link_ratios - 1.0) / self.link_ratio_stds
+        level = LEVEL / (3.0 * len(sigmas))
+        return tuple(number for number, size in enumerate(sigmas) if _chance(float(size)) < level)
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether any test contradicts the prior."""
+        return self.is_misfit or self.is_mass_wrong or bool(self.wrong_links)
+
+
+def check_prior(matrix: FloatArray, right: FloatArray, links: int, tolerance: float) -> PriorCheck:
+    """Test a prior.
+
+    Args:
+        matrix: M, the rows of the links' prior last, ten a link, in the order of the upper triangle of a symmetric
+            4 × 4 matrix, shape (r, x).
+        right: y, shape (r,).
+        links: n.
+        tolerance: of the prior, one relative standard deviation.
+    """
+    basis, _ = np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))
+    left = right - basis @ (basis.T @ right)
+    heavier = np.zeros((len(right), links))
+    first = len(right) - 10 * links
+    on_diagonal = np.array([0, 4, 7, 9])
+    for link in range(links):
+        # E = 1: P, and with it all ten parameters, is 1 + t times the prior's.
+        heavier[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
+    seen = heavier - basis @ (basis.T @ heavier)
+    seen = np.column_stack((seen, seen.sum(axis=1)))  # the last one is of all links together
+    square = np.sum(seen**2, axis=0)
+    visible = square > _VISIBLE * 4.0 / tolerance**2
+    square = np.where(visible, square, np.inf)
+    ratios = 1.0 - (seen.T @ left) / square
+    stds = np.full(links + 1, np.inf)
+    stds[visible] = 1.0 / np.sqrt(square[visible])
+    return PriorCheck(
+        chi_square=float(left @ left),
+        degrees_of_freedom=matrix.shape[0] - matrix.shape[1],
+        mass_ratio=float(ratios[-1]),
+        mass_ratio_std=float(stds[-1]),
+        link_ratios=ratios[:-1],
+        link_ratio_stds=stds[:-1],
+    )
+
+
+def _chance(sigmas: float) -> float:
+    """Probability of a normal number at least as far from zero."""
+    return float(2.0 * special.ndtr(-abs(sigmas)))
