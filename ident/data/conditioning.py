@@ -26,8 +26,8 @@ class Conditioning:
     #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty, it is derived from
     #: each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
-    #: A row is left out when standstill fills more than this share of its filter window. A joint at rest holds any torque
-    #: up to its dry friction: with 0.1, rows beside a stop carry enough of it to look like presliding on a quiet arm.
+    #: A row is left out when standstill fills more than this share of its filter window. A joint at rest holds any
+    #: torque up to its dry friction: with 0.1, rows beside a stop carry enough of it to look like presliding.
     standstill_share: float = 0.05
 
     def document(self) -> dict[str, float | list[float]]:

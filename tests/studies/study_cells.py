@@ -43,7 +43,7 @@ WORLDS = {
 }
 """The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md), the quiet one 0.4 %.
 
-The last has the noise of the first, and friction that differs from run to run, as temperature and remounting make it."""
+The last has the noise of the first, and friction that differs from run to run, as temperature and remounting do it."""
 CORRELATION_S = (0.002, 0.050)
 """Range of the disturbance's correlation time, drawn for each axis, logarithmically uniform [s]."""
 GAIN_SPREAD = 0.10
