@@ -63,7 +63,7 @@ _LOOSE = 1e-9  #: Singular value, of columns of norm one, relative to the larges
 _ROOM = 1e-6  #: Least value of what may not be negative, in units of its scale: above the solver's tolerance
 
 
-class Basis(Enum):
+class RestsOn(Enum):
     """What a parameter's value rests on."""
 
     DATA = "data"
@@ -135,9 +135,9 @@ class FullParameters:
     check: PriorCheck  #: whether data and prior agree
 
     @property
-    def basis(self) -> tuple[Basis, ...]:
+    def basis(self) -> tuple[RestsOn, ...]:
         """What each standard parameter rests on."""
-        return tuple(Basis.PRIOR if share > 0.5 else Basis.DATA for share in self.prior_share)
+        return tuple(RestsOn.PRIOR if share > 0.5 else RestsOn.DATA for share in self.prior_share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

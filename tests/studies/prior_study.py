@@ -35,7 +35,7 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import JOINT_COLUMNS, Model
-from ident.physical.full_parameters import Basis, FullParameters, LinkPrior, full_parameters
+from ident.physical.full_parameters import RestsOn, FullParameters, LinkPrior, full_parameters
 from ident.physical.physical import urdf_links
 from tests.studies.direct_cell import MOVING, RawRun, run_of
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, made_once
@@ -179,7 +179,7 @@ def case(
     """Figures of one prior of one cell, from the true gains, base and standard parameters."""
     # Rotors, friction and offsets have no prior of their own.
     of_link = np.isfinite(full.prior_std)
-    by_data = np.array([basis is Basis.DATA for basis in full.basis])
+    by_data = np.array([basis is RestsOn.DATA for basis in full.basis])
     inside = np.abs(full.standard - standard) < NORMAL_95 * full.standard_std
     check = full.check
     return {
@@ -379,7 +379,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     rows, base_rows, full = real_tx40(folder, options.tx40_tolerance)
     check = full.check
-    by_data = sum(basis is Basis.DATA for basis in full.basis)
+    by_data = sum(basis is RestsOn.DATA for basis in full.basis)
     print_line(
         f"\nreal TX-40, tolerance {options.tx40_tolerance:g}: {by_data} of {len(rows)} parameters by the data; misfit "
         f"{check.chi_square:.0f} for {check.degrees_of_freedom} degrees of freedom; masses "
