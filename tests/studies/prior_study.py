@@ -35,7 +35,7 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import JOINT_COLUMNS, Model
-from ident.physical.full_parameters import RestsOn, FullParameters, LinkPrior, full_parameters
+from ident.physical.full_parameters import FullParameters, LinkPrior, RestsOn, full_parameters
 from ident.physical.physical import urdf_links
 from tests.studies.direct_cell import MOVING, RawRun, run_of
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, made_once

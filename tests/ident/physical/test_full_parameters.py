@@ -16,7 +16,7 @@ from ident.estimators.least_squares import wls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Body, body_of, link_parameters, pseudo_inertia
 from ident.model.model import DriveTrain, Model
-from ident.physical.full_parameters import RestsOn, FullParameters, LinkPrior, full_parameters
+from ident.physical.full_parameters import FullParameters, LinkPrior, RestsOn, full_parameters
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record, three_axes_truth
 
 FloatArray = NDArray[np.float64]
