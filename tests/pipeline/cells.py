@@ -71,6 +71,7 @@ def record_job(
     exchanges: int = 100,
     effects: tuple[UndeclaredEffect, ...] = (),
     noise: float = 1.0,
+    changed: Callable[[CellSpec], CellSpec] = lambda spec: spec,
 ) -> tuple[Job, list[Path]]:
     """Plan, and record in turn without and with the cell's first payload; return the job and its logs.
 
@@ -84,6 +85,7 @@ def record_job(
         exchanges: of moves in planning.
         effects: of the plant, beside those of the simulation file.
         noise: factor of the current noise of the simulation file.
+        changed: makes another plant of the simulation's.
     """
     # A copy: what is written to a controller leaves an audit and a history beside the cell file.
     shutil.copytree(shipped_configurations(), folder / "configs")
@@ -105,6 +107,7 @@ def record_job(
                 declared=mounted is not None,
                 seed=100 * seed + len(logs),
                 effects=effects,
+                changed=changed,
             )
     return job, logs
 

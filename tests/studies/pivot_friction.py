@@ -1,9 +1,10 @@
 """Friction of the pivots that closed chains are cut at, over the whole driver path: what `residual` names.
 
     python -m tests.studies.pivot_friction
-    python -m tests.studies.pivot_friction --only five-bar-tip-0.3 five-bar-clean-1
+    python -m tests.studies.pivot_friction --only five-bar-tip-0.3 five-bar-clean-31
 
-Twelve cells have such friction, in each pivot of the shipped planar robots at three sizes, and six have none. A
+Twelve cells have such friction, in each pivot of the shipped planar robots at three sizes. Beside them are the plants
+as they are shipped, with small friction in the joints of the tree that have no motor, and clean plants without that. A
 finished cell is kept in out/pivot-study/ while its row and its files are the same. Prints a line for each, and writes
 docs/evidence/data/pivots.csv once all are there.
 """
@@ -16,7 +17,7 @@ import csv
 import io
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from daq.environment import shipped_configurations
 from daq.errors import ExitCode
 from daq.files import replace_file
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
-from drivers.simulation.spec import UndeclaredEffect
+from drivers.simulation.spec import CellSpec, UndeclaredEffect
 from tests.pipeline.cells import as_json, record_job
 from tests.studies.fingerprint import digest, made_once
 
@@ -51,8 +52,12 @@ class PivotCell:
     def name(self) -> str:
         """Name for files and options."""
         if self.closure is None:
-            return f"{self.robot}-clean-{self.seed}"
+            return f"{self.robot}-shipped-{self.seed}"
         return f"{self.robot}-{self.closure}-{self.dry_nm:g}"
+
+    def plant(self, spec: CellSpec) -> CellSpec:
+        """Return the plant without the friction of its pivot, from the shipped one."""
+        return spec
 
     @property
     def effects(self) -> tuple[UndeclaredEffect, ...]:
@@ -71,20 +76,38 @@ class PivotCell:
         return digest(self, files)
 
 
+class CleanCell(PivotCell):
+    """A plant without friction in any joint that has no motor."""
+
+    @property
+    def name(self) -> str:
+        """Name for files and options."""
+        return f"{self.robot}-clean-{self.seed}"
+
+    def plant(self, spec: CellSpec) -> CellSpec:
+        """Return the shipped plant without friction of its passive joints."""
+        return replace(spec, passive={})
+
+
 PIVOTS = (("five-bar", "tip"), ("dualv", "arm-2"), ("dualv", "arm-3"), ("dualv", "arm-4"))
 SIZES_NM = {"five-bar": (0.3, 0.6, 1.2), "dualv": (0.1, 0.2, 0.3)}
 """A half, one and two times the dry friction of a drive of the five-bar; a third to one of a DualV's. With 0.6 Nm in
 one pivot, the DualV's recording is refused: a move does not end within its time."""
 
+SHIPPED_SEEDS = {"five-bar": (21, 22, 23), "dualv": (21,)}
+CLEAN_SEEDS = {"five-bar": (31, 32, 33), "dualv": (31, 32)}
+
 
 def cells() -> tuple[PivotCell, ...]:
-    """Every cell of the study: with friction, then clean."""
+    """Every cell of the study: with friction of a pivot, as shipped, clean."""
     found = []
     for number, (robot, closure) in enumerate(PIVOTS):
         for place, size_nm in enumerate(SIZES_NM[robot]):
             found.append(PivotCell(robot, closure, size_nm, seed=1 + 3 * number + place))
-    for robot in SIZES_NM:
-        found += [PivotCell(robot, None, 0.0, seed) for seed in (21, 22, 23)]
+    for robot, seeds in SHIPPED_SEEDS.items():
+        found += [PivotCell(robot, None, 0.0, seed) for seed in seeds]
+    for robot, seeds in CLEAN_SEEDS.items():
+        found += [CleanCell(robot, None, 0.0, seed) for seed in seeds]
     return tuple(found)
 
 
@@ -92,7 +115,14 @@ def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
     """Record a run without load and one with the weighed payload, and search: what is named, and the gains' errors."""
     with contextlib.redirect_stdout(io.StringIO()):
         job, logs = record_job(
-            cell.robot, folder, seconds=SECONDS, pairs=1, seed=cell.seed, exchanges=0, effects=cell.effects
+            cell.robot,
+            folder,
+            seconds=SECONDS,
+            pairs=1,
+            seed=cell.seed,
+            exchanges=0,
+            effects=cell.effects,
+            changed=cell.plant,
         )
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         code = drivegain(["residual", *map(str, logs), "--json"])
@@ -140,15 +170,18 @@ def line_of(row: dict[str, Any]) -> list[str]:
 
 
 def verdict(rows: Sequence[dict[str, Any]]) -> str:
-    """Count cells that are named as what they are, other names, and clean cells that are silent."""
+    """Count cells by what is named: the pivot, another name, a pivot without friction, nothing."""
     planted = [row for row in rows if row["planted"] != "none"]
-    clean = [row for row in rows if row["planted"] == "none"]
+    shipped = [row for row in rows if "-shipped-" in row["cell"]]
+    clean = [row for row in rows if "-clean-" in row["cell"]]
     named = [row for row in planted if f"{FAMILY} on {row['planted']}" in row["named"]]
     others = [row for row in planted if set(row["named"]) - {f"{FAMILY} on {row['planted']}"}]
+    on_pivots = [row for row in shipped if any(" on pivot " in name for name in row["named"])]
     silent = [row for row in clean if not row["named"]]
     return (
-        f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; "
-        f"{len(silent)} of {len(clean)} clean cells silent"
+        f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; friction of the tree "
+        f"named on a pivot in {len(on_pivots)} of {len(shipped)} shipped plants; {len(silent)} of {len(clean)} clean "
+        "plants silent"
     )
 
 
@@ -162,7 +195,8 @@ def main(arguments: list[str] | None = None) -> int:
     for cell in cells():
         if cell.name not in chosen:
             continue
-        rows.append(made_once(OUT, cell.name, cell.fingerprint, partial(study_cell, cell)))
+        row = made_once(OUT, cell.name, cell.fingerprint, partial(study_cell, cell))
+        rows.append(row | {"cell": cell.name})
         sys.stdout.write(f"{'; '.join(line_of(rows[-1]))}\n")
         sys.stdout.flush()
     sys.stdout.write(f"{verdict(rows)}\n")
