@@ -63,7 +63,7 @@ _LOOSE = 1e-9  #: Singular value, of columns of norm one, relative to the larges
 _ROOM = 1e-6  #: Least value of what may not be negative, in units of its scale: above the solver's tolerance
 
 
-class Basis(Enum):
+class RestsOn(Enum):
     """What a parameter's value rests on."""
 
     DATA = "data"
@@ -135,9 +135,9 @@ class FullParameters:
     check: PriorCheck  #: whether data and prior agree
 
     @property
-    def basis(self) -> tuple[Basis, ...]:
+    def basis(self) -> tuple[RestsOn, ...]:
         """What each standard parameter rests on."""
-        return tuple(Basis.PRIOR if share > 0.5 else Basis.DATA for share in self.prior_share)
+        return tuple(RestsOn.PRIOR if share > 0.5 else RestsOn.DATA for share in self.prior_share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,7 +242,13 @@ def full_parameters(
         eigenvalues=np.asarray(np.linalg.eigvalsh(relative_to_prior(prior.factors, standard[links]))[:, 0]),
         bounded=is_bounded,
         variance_ratio=ratio,
-        check=check_prior(equations.matrix, equations.right, len(prior.links), prior.tolerance),
+        check=check_prior(
+            equations.matrix,
+            equations.right,
+            equations.weight @ equations.covariance @ equations.weight.T,
+            len(prior.links),
+            prior.tolerance,
+        ),
     )
 
 

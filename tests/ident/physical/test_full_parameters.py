@@ -16,7 +16,7 @@ from ident.estimators.least_squares import wls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Body, body_of, link_parameters, pseudo_inertia
 from ident.model.model import DriveTrain, Model
-from ident.physical.full_parameters import Basis, FullParameters, LinkPrior, full_parameters
+from ident.physical.full_parameters import FullParameters, LinkPrior, RestsOn, full_parameters
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record, three_axes_truth
 
 FloatArray = NDArray[np.float64]
@@ -141,12 +141,12 @@ def test_each_parameter_says_what_it_rests_on(noisy_found: Identification, truth
     full = full_parameters(noisy_found.system, noisy_found.estimate, prior)
     assert len(full.basis) == len(truth.model.columns)
     for name in ("fv1", "fs2", "off3", "fs6"):
-        assert full.basis[_index(full, name)] is Basis.DATA
+        assert full.basis[_index(full, name)] is RestsOn.DATA
         assert full.prior_share[_index(full, name)] < 0.1
     # No torque depends on the mass of the first link, nor on its moments across the axis.
     for name in ("m1", "Ixx1", "mz1"):
         place = _index(full, name)
-        assert full.basis[place] is Basis.PRIOR
+        assert full.basis[place] is RestsOn.PRIOR
         assert full.prior_share[place] == pytest.approx(1.0)
         assert full.standard[place] == pytest.approx(truth.parameters[place], abs=1e-6)
         assert full.standard_std[place] == pytest.approx(full.prior_std[place])
@@ -159,11 +159,11 @@ def test_a_rotor_that_is_known_with_its_link_alone_rests_on_the_prior_of_the_lin
     full = full_parameters(clean_found.system, clean_found.estimate, LinkPrior(_links(truth), 0.1))
     rotor = _index(full, "Ia1")
     assert np.isinf(full.prior_std[rotor])
-    assert full.basis[rotor] is Basis.PRIOR
+    assert full.basis[rotor] is RestsOn.PRIOR
     first = clean_found.system.base.grouping[0]
     assert first[_index(full, "Izz1")] != 0.0
     assert first[rotor] != 0.0
-    assert full.basis[_index(full, "fv1")] is Basis.DATA
+    assert full.basis[_index(full, "fv1")] is RestsOn.DATA
 
 
 def test_no_prior_decides_where_the_tolerance_is_wide_and_the_data_are_sharp(
@@ -221,8 +221,8 @@ def test_rotors_of_which_the_data_show_the_difference_alone() -> None:
     assert min(full.standard[one], full.standard[other]) >= 0.0
     difference = full.standard[one] - full.standard[other]
     assert difference == pytest.approx(0.1, abs=0.1)
-    assert full.basis[one] is Basis.PRIOR
-    assert full.basis[other] is Basis.PRIOR
+    assert full.basis[one] is RestsOn.PRIOR
+    assert full.basis[other] is RestsOn.PRIOR
 
 
 def test_fixed_gains_stay(small: Evidence, small_truth: Truth, small_runs: tuple[object, ...]) -> None:
