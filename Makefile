@@ -180,6 +180,9 @@ geometry-study: setup
 damage-study: setup
 	$(BIN)/python -m tests.studies.damaged_recordings
 
+prior-study: setup
+	$(BIN)/python -m tests.studies.prior_study
+
 weigh-study: setup
 	$(BIN)/python -m tests.studies.weigh_study --arm three
 	$(BIN)/python -m tests.studies.weigh_study --arm tx40

@@ -186,7 +186,7 @@ class FullSetEntry(StrictModel):
     gains: tuple[GainWithPriorEntry, ...]
     bounded: bool
     chi_square: _Positive
-    degrees_of_freedom: Annotated[int, Field(ge=0, le=10**6)]
+    degrees_of_freedom: _Positive
     mass_ratio: _Number | None
     mass_ratio_std: _Positive | None
     contradictions: tuple[str, ...]

@@ -11,6 +11,8 @@ from daq.report.text import Sentence, plain_table, terminal_text
 from ident.calibration import Calibration
 from ident.physical.full_set import FullSet
 
+_ROUNDING = 1e-6  #: Share of its σ below which a value is shown as zero
+
 
 def full_parameter_view(calibration: Calibration, found: FullSet) -> Iterator[RenderableType]:
     """Every standard parameter with its σ and what it rests on, and whether the data agree with the prior."""
@@ -47,9 +49,9 @@ def full_parameter_table(found: FullSet) -> Table:
     for one in found.parameters:
         prior = "-" if one.prior is None else f"{one.prior:.4g}"
         prior_std = "-" if one.prior_std is None else f"{one.prior_std:.2g}"
-        table.add_row(
-            terminal_text(one.name), f"{one.value:.4g}", f"{one.std:.2g}", one.unit, one.basis, prior, prior_std
-        )
+        is_rounding = abs(one.value) < _ROUNDING * one.std
+        value = 0.0 if is_rounding else one.value
+        table.add_row(terminal_text(one.name), f"{value:.4g}", f"{one.std:.2g}", one.unit, one.basis, prior, prior_std)
     return table
 
 

@@ -9,10 +9,13 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.errors import ConfigurationInconsistent, UsageError
+from daq.workflow.diagnoses import by_likelihood
 from daq.workflow.fit import Fit
 from ident.arrays import FloatArray
 from ident.effects.effect import Property
 from ident.errors import ModelError
+from ident.estimators.estimate import Estimate
+from ident.estimators.method import Method
 from ident.model.robot import Joint
 from ident.model.urdf import read_urdf
 from ident.physical.full_parameters import FullParameters, LinkPrior, full_parameters
@@ -34,7 +37,8 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         tolerance: one relative standard deviation of masses and second moments.
 
     Raises:
-        UsageError: the robot has a closed chain, or the URDF has no inertia for one of its links.
+        UsageError: the robot has a closed chain, the URDF has no inertia for one of its links, or the gains are by an
+            estimator whose σ takes neighbouring rows for independent.
         ConfigurationInconsistent: the URDF is of another robot.
         NotPhysical: no possible robot was found.
     """
@@ -45,7 +49,7 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     effects = fitted.steps[-1].after.effects if fitted.steps else ()
     friction = frozenset(one.axis for one in effects if one.effect.declares is Property.ODD_IN_VELOCITY)
     try:
-        found = full_parameters(final.system, final.estimate, prior, friction)
+        found = full_parameters(final.system, _with_std_by_moves(fitted), prior, friction)
     except ModelError as error:
         raise UsageError(
             "--prior",
@@ -79,6 +83,28 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     )
 
 
+def _with_std_by_moves(fitted: Fit) -> Estimate:
+    """Return the estimate with σ from leaving out moves.
+
+    Neighbouring rows share their errors. σ of ``ls``, ``wls`` and ``tls`` takes them for independent, which would call
+    data what is the prior's, and right priors wrong. With fixed gains, ``ml`` fits the same parameters.
+
+    Raises:
+        UsageError: of free gains, whose values ``ml`` would change.
+    """
+    estimate = fitted.estimate
+    if estimate.method.is_of_currents:
+        return estimate
+    if not estimate.gains_fixed:
+        raise UsageError(
+            f"--method {estimate.method.value}",
+            found="--prior or --prior-tolerance beside it",
+            expected=f"{Method.ML.value}, whose σ comes from leaving out moves",
+            remedy="leave out --method",
+        )
+    return by_likelihood(estimate, fitted.final.system)
+
+
 def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
     """Say why a prior is wrong; nothing where the data agree with it.
 
@@ -95,7 +121,7 @@ def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
     if check.is_misfit:
         yield (
             f"it misses the data by {check.chi_square:.0f}, where its tolerance explains "
-            f"{check.degrees_of_freedom} (χ²)"
+            f"{check.degrees_of_freedom:.0f} (χ²)"
         )
 
 

@@ -242,7 +242,13 @@ def full_parameters(
         eigenvalues=np.asarray(np.linalg.eigvalsh(relative_to_prior(prior.factors, standard[links]))[:, 0]),
         bounded=is_bounded,
         variance_ratio=ratio,
-        check=check_prior(equations.matrix, equations.right, len(prior.links), prior.tolerance),
+        check=check_prior(
+            equations.matrix,
+            equations.right,
+            equations.weight @ equations.covariance @ equations.weight.T,
+            len(prior.links),
+            prior.tolerance,
+        ),
     )
 
 

@@ -39,7 +39,7 @@ class FullSet:
     gains: tuple[GainWithPrior, ...]  #: one an axis; empty for fixed gains
     bounded: bool  #: values were moved to those of a robot that can exist
     chi_square: float  #: misfit of data and prior
-    degrees_of_freedom: int  #: its mean where the prior is right
+    degrees_of_freedom: float  #: its mean where the prior is right
     #: How heavy all links are by the data, relative to the prior; None where the data do not show it.
     mass_ratio: float | None
     mass_ratio_std: float | None  #: its σ, the prior's tolerance included; None likewise

@@ -1,10 +1,14 @@
 """Whether data contradict a prior: by its misfit as a whole, and by how heavy they find its links.
 
-Rows of data and prior in units of their σ, M x = y, leave a misfit ‖y − M x̂‖² that has the chi-square distribution with
-as many degrees of freedom as there are more rows than unknowns. It is weak against one mistake that all links share:
-30 % too heavy is 1.5 σ for a tolerance of 20 %, one link at a time. A prior whose links all weigh 1 + s times what it
-says adds a column to M, M x − s c = y; s and its σ by least squares are a test of that alone, and so is the same for
-each link.
+Rows of data and prior in units of their σ, M x = y, leave a misfit r = (1 − Q Qᵀ) y, Q an orthonormal basis of M. With
+S the covariance of the rows, that of r is Σ = (1 − Q Qᵀ) S (1 − Q Qᵀ). S is not quite one: the weights of the data are
+those of independent rows, and their errors are not. ‖r‖² has the mean tr Σ and the variance 2 tr Σ², so
+‖r‖² tr Σ / tr Σ² has nearly the chi-square distribution with (tr Σ)² / tr Σ² degrees of freedom (Satterthwaite,
+Biometrics Bulletin 2 (1946)).
+
+The misfit is weak against one mistake that all links share: 30 % too heavy is 1.5 σ for a tolerance of 20 %, one link
+at a time. A prior whose links all weigh 1 + s times what it says adds a column to M, M x − s c = y; s by least squares,
+with its σ by S, is a test of that alone, and so is the same for each link.
 """
 
 from __future__ import annotations
@@ -26,8 +30,8 @@ _VISIBLE = 1e-12  #: Share of a link's rows that other parameters leave, below w
 class PriorCheck:
     """Tests of a prior with n links by data."""
 
-    chi_square: float  #: misfit of data and prior
-    degrees_of_freedom: int  #: its mean where the prior is right
+    chi_square: float  #: scaled misfit of data and prior
+    degrees_of_freedom: float  #: its mean where the prior is right
     mass_ratio: float  #: how heavy all links are, by the data, relative to the prior
     mass_ratio_std: float  #: its σ, the prior's tolerance included; infinite where the data do not show it
     link_ratios: FloatArray  #: the same of each link, shape (n,)
@@ -56,35 +60,47 @@ class PriorCheck:
         return self.is_misfit or self.is_mass_wrong or bool(self.wrong_links)
 
 
-def check_prior(matrix: FloatArray, right: FloatArray, links: int, tolerance: float) -> PriorCheck:
+def check_prior(
+    matrix: FloatArray, right: FloatArray, data_covariance: FloatArray, links: int, tolerance: float
+) -> PriorCheck:
     """Test a prior.
 
     Args:
-        matrix: M, the rows of the links' prior last, ten a link, in the order of the upper triangle of a symmetric
-            4 × 4 matrix, shape (r, x).
+        matrix: M, the rows of the data first, those of the links' prior last, ten a link, in the order of the upper
+            triangle of a symmetric 4 × 4 matrix, shape (r, x).
         right: y, shape (r,).
+        data_covariance: S of the rows of the data, shape (d, d); that of the prior's is one.
         links: n.
         tolerance: of the prior, one relative standard deviation.
     """
     basis, _ = np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))
     left = right - basis @ (basis.T @ right)
-    heavier = np.zeros((len(right), links))
-    first = len(right) - 10 * links
+    rows = len(right)
+    data = len(data_covariance)
+    covariance = np.eye(rows)
+    covariance[:data, :data] = data_covariance
+    rest = np.eye(rows) - basis @ basis.T
+    spread = rest @ covariance @ rest
+    mean = float(np.trace(spread))
+    square_sum = float(np.sum(spread**2))
+    heavier = np.zeros((rows, links))
+    first = rows - 10 * links
     on_diagonal = np.array([0, 4, 7, 9])
     for link in range(links):
         # E = 1: P, and with it all ten parameters, is 1 + t times the prior's.
         heavier[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
-    seen = heavier - basis @ (basis.T @ heavier)
+    seen = rest @ heavier
     seen = np.column_stack((seen, seen.sum(axis=1)))  # the last one is of all links together
     square = np.sum(seen**2, axis=0)
     visible = square > _VISIBLE * 4.0 / tolerance**2
     square = np.where(visible, square, np.inf)
-    ratios = 1.0 - (seen.T @ left) / square
+    weights = seen / square
+    ratios = 1.0 - weights.T @ left
     stds = np.full(links + 1, np.inf)
-    stds[visible] = 1.0 / np.sqrt(square[visible])
+    stds[visible] = np.sqrt(np.einsum("rl,rs,sl->l", weights, covariance, weights))[visible]
     return PriorCheck(
-        chi_square=float(left @ left),
-        degrees_of_freedom=matrix.shape[0] - matrix.shape[1],
+        chi_square=float(left @ left) * mean / square_sum,
+        degrees_of_freedom=mean**2 / square_sum,
         mass_ratio=float(ratios[-1]),
         mass_ratio_std=float(stds[-1]),
         link_ratios=ratios[:-1],

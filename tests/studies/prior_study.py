@@ -195,6 +195,8 @@ def case(
         "bounded": full.bounded,
         "chi_square": check.chi_square,
         "degrees_of_freedom": check.degrees_of_freedom,
+        "link_z": ((check.link_ratios - 1.0) / check.link_ratio_stds).tolist(),
+        "misfit": check.is_misfit,
         "mass_ratio": check.mass_ratio,
         "mass_ratio_std": check.mass_ratio_std,
         "noticed": check.is_wrong,
@@ -340,6 +342,19 @@ def real_tx40(folder: Path, tolerance: float) -> tuple[list[list[str]], list[lis
     return rows, base_rows, full
 
 
+def agreement(base_rows: Iterable[Sequence[str]]) -> str:
+    """Say how far the TX-40's base parameters are from the published ones, as a share of both σ together."""
+    sigmas: dict[str, list[float]] = {"the fit": [], "the fit with the prior": []}
+    for _, published, published_std, *others in base_rows:
+        if not published:
+            continue
+        for name, value, std in zip(sigmas, others[::2], others[1::2], strict=True):
+            both = float(np.hypot(float(std), float(published_std)))
+            sigmas[name].append(abs(float(value) - float(published)) / both)
+    said = [f"{name} {np.sum(np.array(one) < 2.0)} of {len(one)}" for name, one in sigmas.items()]
+    return f"base parameters within 2 σ of the published ones: {', '.join(said)}"
+
+
 def write_csv(path: Path, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Write a table of the documentation."""
     with path.open("w", encoding="utf-8", newline="") as stream:
@@ -382,10 +397,11 @@ def main(arguments: list[str] | None = None) -> int:
     by_data = sum(basis is RestsOn.DATA for basis in full.basis)
     print_line(
         f"\nreal TX-40, tolerance {options.tx40_tolerance:g}: {by_data} of {len(rows)} parameters by the data; misfit "
-        f"{check.chi_square:.0f} for {check.degrees_of_freedom} degrees of freedom; masses "
+        f"{check.chi_square:.0f} for {check.degrees_of_freedom:.0f} degrees of freedom; masses "
         f"{check.mass_ratio:.2f} ± {check.mass_ratio_std:.2f} of the prior's; called wrong: {check.is_wrong}; "
         f"bounded: {full.bounded}; least eigenvalue {full.eigenvalues.min():.2g}"
     )
+    print_line(agreement(base_rows))
     headings = ("parameter", "unit", "prior", "value", "std", "basis", "prior's share of the variance %")
     write_csv(TABLES / "prior-tx40.csv", headings, rows)
     headings = ("base parameter", "published", "std", "fit", "std", "with the prior", "std")

@@ -27,6 +27,7 @@ from daq.ledger.watch import Series, watch
 from daq.report import (
     bus_views,
     fit,
+    full_parameters,
     gains,
     history,
     paper_tables,
@@ -51,6 +52,7 @@ from ident.data.torque_channel import TorqueSlope
 from ident.discovery.loop import Step
 from ident.estimators.comparison import ESTIMATORS, EstimatorComparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
+from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 from tests.daq.calibrations import demo_calibration
 from tests.daq.histories import fill, ledger_in
 
@@ -216,6 +218,16 @@ def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     return urdf_views.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
 
 
+def _full(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    parameters = (
+        FullParameter("Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5),
+        FullParameter("fvm12", 1.234e-5, 1.2e-6, "Nm/(rad/s)", "data", 0.0, None, None),
+    )
+    others = tuple(GainWithPrior(gain.axis, gain.value, gain.std) for gain in GAINS)
+    full = FullSet("arm.urdf", "a" * 64, 0.1, parameters, others, True, 1.0, 1, 1.0, 0.1, ())
+    return full_parameters.full_parameter_view(replace(CALIBRATION, gains=tuple(GAINS)), full)
+
+
 def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
     summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
     results: tuple[Summary | Failure, ...] = (summary, Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4))
@@ -246,6 +258,8 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "fit.comparison_tables": _comparison,
     "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
     "fleet.fleet_view": _fleet,
+    "full_parameters.full_parameter_table": _full,
+    "full_parameters.gains_with_prior_table": _full,
     "gains.gain_table": lambda _cell, _: [gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")],
     "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],

@@ -1,0 +1,146 @@
+"""`drivegain fit --prior`: every parameter of a real robot, and URDFs that are no prior of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import daq.environment
+from daq.cli.app import main
+from daq.documents.calibration_file import decode_calibration, encode_calibration, load_calibration
+from daq.errors import ConfigurationInconsistent, ExitCode, UsageError
+from daq.report.full_parameters import full_parameter_view
+from daq.workflow.fit import Fit, fit
+from daq.workflow.full_parameters import OF_CELL, full_set
+from ident.estimators.method import Method
+from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
+from tests.daq.calibrations import AXES, demo_calibration
+
+
+@pytest.fixture(scope="module")
+def urdf(checkout: Path) -> str:
+    """The TX-40's URDF, with rough inertias."""
+    return (checkout / "configs" / "robots" / "tx40.urdf").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def fitted(real: tuple[Path, Path]) -> Fit:
+    """The real TX-40 with its gains fixed."""
+    return fit([real[1]], gains_fixed=True)
+
+
+def _fit(log: Path, *options: object) -> int:
+    return main(["fit", str(log), "--gains", "fixed", *map(str, options)])
+
+
+def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
+    real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log = real
+    out = tmp_path / "calibration.yaml"
+    capsys.readouterr()
+    assert _fit(log, "--method", "ml", "--prior-tolerance", 0.2, "--out", out, "--json") == ExitCode.OK
+    document = json.loads(capsys.readouterr().out)["full_parameters"]
+    assert document["urdf"] == OF_CELL
+    assert document["contradictions"] == []
+    assert document["gains"] == []
+    parameters = {one["name"]: one for one in document["parameters"]}
+    assert len(parameters) == 87
+    assert parameters["fv1"]["basis"] == "data"
+    assert parameters["m1"]["basis"] == "prior"
+    assert parameters["m1"]["value"] == pytest.approx(parameters["m1"]["prior"])
+    assert parameters["m1"]["std"] == pytest.approx(0.2 * parameters["m1"]["prior"])
+    assert all(one["std"] > 0.0 for one in parameters.values())
+    assert all(parameters[f"m{number}"]["value"] > 0.0 for number in range(1, 7))
+    # The torque of the full set is that of the fit: its combinations are the base parameters, within their σ.
+    read = load_calibration(out)
+    assert read.full_parameters is not None
+    differences = []
+    for base in read.parameters:
+        terms = re.findall(r"(?:^|([+-]) )(?:([0-9.e+-]+)\*)?([A-Za-z]+[0-9])(?= |$)", base.name)
+        value = 0.0
+        for sign, size, name in terms:
+            value += float(f"{sign}{size or 1.0}") * parameters[name]["value"]
+        differences.append((value - base.value) / base.std)
+    assert np.median(np.abs(differences)) < 1.0
+
+
+def test_masses_that_are_wrong_are_said(fitted: Fit, urdf: str) -> None:
+    heavy = full_set(fitted, _scaled(urdf, 1.5), "heavy.urdf", 0.1)
+    assert heavy.contradictions[0].startswith("by the data, the links together weigh 0.")
+    calibration = replace(demo_calibration(), full_parameters=heavy)
+    said = "\n".join(map(str, full_parameter_view(calibration, heavy)))
+    assert "CHECK the prior: by the data, the links together weigh 0." in said
+    assert "What is marked `prior` is not to be trusted" in said
+
+
+def _scaled(urdf: str, factor: float) -> str:
+    def scaled(found: re.Match[str]) -> str:
+        return f'{found[1]}="{factor * float(found[2])!r}"'
+
+    return re.sub(r'(<mass value|i[xyz][xyz])="([^"]+)"', scaled, urdf)
+
+
+def test_a_urdf_that_is_no_prior_of_this_robot_is_refused(fitted: Fit, urdf: str, checkout: Path) -> None:
+    other = (checkout / "configs" / "robots" / "gantry.urdf").read_text(encoding="utf-8")
+    longer = urdf.replace("0.225 0 0.035", "0.250 0 0.035")
+    assert longer != urdf
+    bare = re.sub(r"(?s)<inertial>.*?</inertial>", "", urdf)
+    with pytest.raises(ConfigurationInconsistent, match="another robot: 5 moving joints"):
+        full_set(fitted, other, "gantry.urdf", 0.1)
+    with pytest.raises(ConfigurationInconsistent, match="another robot: J3; expected the 6 joints"):
+        full_set(fitted, longer, "longer.urdf", 0.1)
+    with pytest.raises(ConfigurationInconsistent, match="expected a URDF"):
+        full_set(fitted, "<no", "no.urdf", 0.1)
+    with pytest.raises(UsageError, match="no possible inertia for the links of J1, J2"):
+        full_set(fitted, bare, "bare.urdf", 0.1)
+
+
+def test_gains_by_an_estimator_without_sigma_by_moves_are_refused(fitted: Fit, urdf: str) -> None:
+    estimate = replace(fitted.identification.estimate, method=Method.WLS, gains_fixed=False)
+    free = replace(fitted, identification=replace(fitted.identification, estimate=estimate))
+    with pytest.raises(UsageError, match="expected ml, whose σ comes from leaving out moves"):
+        full_set(free, urdf, "arm.urdf", 0.1)
+
+
+def test_options_that_leave_parameters_out_are_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = tmp_path / "none.mcap"
+    assert _fit(missing, "--prior-tolerance", 0.1, "--essential", 10) == ExitCode.USAGE
+    assert "--prior" in capsys.readouterr().err
+    monkeypatch.setattr(daq.environment, "find_spec", lambda _: None)
+    assert _fit(missing, "--prior-tolerance", 0.1) == ExitCode.CONFIGURATION
+    assert "pip install 'drivegain[physical]'" in capsys.readouterr().err
+
+
+def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> None:
+    full = FullSet(
+        urdf="arm.urdf",
+        urdf_sha256="a" * 64,
+        tolerance=0.1,
+        parameters=(
+            FullParameter("m2", 3.4, 0.3, "kg", "prior", 0.8, 3.5, 0.35),
+            FullParameter("fv2", 5.5, 0.05, "Nm/(rad/s)", "data", 0.0, None, None),
+        ),
+        gains=tuple(GainWithPrior(axis, 30.0, 0.1) for axis in AXES),
+        bounded=False,
+        chi_square=31.0,
+        degrees_of_freedom=34,
+        mass_ratio=None,
+        mass_ratio_std=None,
+        contradictions=(),
+    )
+    calibration = replace(demo_calibration(), full_parameters=full)
+    content = encode_calibration(calibration)
+    assert decode_calibration(content, "calibration.yaml").full_parameters == full
+    older = yaml.safe_load(encode_calibration(demo_calibration()))
+    del older["full_parameters"]
+    del older["digests"]["full_parameters"]
+    assert decode_calibration(yaml.safe_dump(older).encode(), "calibration.yaml").full_parameters is None
