@@ -7,7 +7,7 @@ weighed payload. Each is fitted once. Then each tolerance has priors drawn aroun
 that the prior declares (`right`), and these with all masses and inertias times 1.3 (`heavy`), 0.7 (`light`), or either
 of them, link by link (`mixed`). Cells are kept in out/prior-study; a study that was interrupted goes on where it was.
 The real TX-40, where DRIVEGAIN_DATA has it, is fitted with fixed gains and the prior of the cell's URDF.
-Writes docs/evidence/data/prior*.csv if all cells are there.
+Writes the tables of docs/evidence/prior.md if all cells are there.
 """
 
 from __future__ import annotations
