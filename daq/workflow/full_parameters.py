@@ -113,16 +113,22 @@ def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
         joints: names of the joints that move the links.
     """
     if check.is_mass_wrong:
-        size = f"{check.mass_ratio:.2f} ± {check.mass_ratio_std:.2f}"
-        yield f"by the data, the links together weigh {size} times what it says"
+        yield f"by the data, the links together are {_weight(check.mass_ratio, check.mass_ratio_std)}"
     for link in check.wrong_links:
-        size = f"{check.link_ratios[link]:.2f} ± {check.link_ratio_stds[link]:.2f}"
-        yield f"by the data, the link of joint {joints[link]} weighs {size} times what it says"
+        weight = _weight(float(check.link_ratios[link]), float(check.link_ratio_stds[link]))
+        yield f"by the data, the link of joint {joints[link]} is {weight}"
     if check.is_misfit:
         yield (
             f"it misses the data by {check.chi_square:.0f}, where its tolerance explains "
             f"{check.degrees_of_freedom:.0f} (χ²)"
         )
+
+
+def _weight(ratio: float, std: float) -> str:
+    """Say how heavy something is relative to the prior; a ratio of least squares may be negative, a mass not."""
+    if ratio <= std:
+        return "far lighter than it says"
+    return f"{ratio:.2f} ± {std:.2f} times as heavy as it says"
 
 
 def _parameters(found: FullParameters, of_links: FloatArray) -> Iterator[FullParameter]:

@@ -73,10 +73,10 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
 
 def test_masses_that_are_wrong_are_said(fitted: Fit, urdf: str) -> None:
     heavy = full_set(fitted, _scaled(urdf, 1.5), "heavy.urdf", 0.1)
-    assert heavy.contradictions[0].startswith("by the data, the links together weigh 0.")
+    assert heavy.contradictions[0].startswith("by the data, the links together are 0.")
     calibration = replace(demo_calibration(), full_parameters=heavy)
     said = "\n".join(map(str, full_parameter_view(calibration, heavy)))
-    assert "CHECK the prior: by the data, the links together weigh 0." in said
+    assert "CHECK the prior: by the data, the links together are 0." in said
     assert "What is marked `prior` is not to be trusted" in said
 
 
