@@ -1,0 +1,319 @@
+"""One judgement of the channels of a recording: what is wrong with single numbers, and whether it can be mended.
+
+Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A stretch in which a
+channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign, and
+an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which
+too much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
+sign `ident.data.unsigned_current`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.frozen import at_limit, frozen_current, frozen_position
+from ident.data.glitches import Jumps, Readings, find_jumps, is_split, wrap_size
+from ident.data.held import fill_damaged, held_channel
+
+LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
+LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
+LOST_PLACE = 3.0
+"""Least step of a position after which it does not return, in multiples of its largest usual step."""
+USUAL_PERCENTILE = 99.0  #: Of the steps of a position
+MOTOR_UNIT, JOINT_UNIT = "rad of the motor", "rad or m of the joint"
+ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
+
+
+class Quantity(Enum):
+    """What a channel holds."""
+
+    POSITION = "position"
+    CURRENT = "current"
+
+
+class FaultKind(Enum):
+    """What is wrong with a channel."""
+
+    GLITCH = "glitch"
+    FROZEN = "frozen"
+    CLIPPED = "clipped"
+    WRAPPING = "wrapping"
+    UNSIGNED = "unsigned"
+    DISPLACED = "displaced"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelFault:
+    """Something wrong with one channel of a recording."""
+
+    kind: FaultKind
+    quantity: Quantity
+    axis: int  #: index
+    stretches: IntArray  #: first sample and end of each, shape (s, 2)
+    size: float  #: largest distance from the course, or the range of a counter, in the unit of the channel
+    samples: int  #: of the recording
+    rate_hz: float  #: of the recording
+    count: float = 0.0  #: smallest change of the channel
+    unit: str = ""  #: of the channel, for messages
+
+    @property
+    def share(self) -> float:
+        """Share of the samples of the recording."""
+        return float(np.sum(self.stretches[:, 1] - self.stretches[:, 0])) / self.samples
+
+    @property
+    def first(self) -> int:
+        """First sample of it."""
+        return int(self.stretches[0, 0])
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the recording cannot be used."""
+        if self.kind is FaultKind.GLITCH:
+            return self.share > LARGEST_GLITCHED
+        if self.kind in {FaultKind.FROZEN, FaultKind.CLIPPED}:
+            return self.share > LARGEST_FROZEN
+        return True
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether its samples are filled in; those of others are left out."""
+        return self.kind is FaultKind.GLITCH
+
+
+def find_faults(
+    position: FloatArray,
+    current: FloatArray,
+    rate_hz: float,
+    ratio: FloatArray | None = None,
+    usable: BoolArray | None = None,
+    unit: str = MOTOR_UNIT,
+) -> tuple[ChannelFault, ...]:
+    """Judge the channels of a recording.
+
+    Args:
+        position: of the joints, or of whatever was recorded, shape (k, n).
+        current: of the motors, shape (k, n).
+        rate_hz: sampling rate.
+        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where each column was
+            recorded as it is.
+        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding. None for all.
+        unit: of the columns of positions, for messages.
+
+    Returns:
+        what is wrong, positions first, by axis.
+    """
+    if len(position) < 2:
+        return ()
+    found: list[ChannelFault] = []
+    count = position.shape[1]
+    read = position if ratio is None else motor_positions(position, ratio)
+    for axis in range(count):
+        found += _position_faults(read[:, axis], axis, rate_hz, unit)
+    if ratio is not None:
+        found += _joint_faults(position, ratio, rate_hz, {one.axis for one in found})
+    for axis in range(current.shape[1]):
+        found += _current_faults(current[:, axis], read[:, axis], axis, rate_hz)
+    if usable is None:
+        return tuple(found)
+    return tuple(one for one in found if _is_in_use(one, usable))
+
+
+def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Return what the encoders of the motors have read, shape (k, n): a number that repeats repeats exactly.
+
+    Args:
+        position: of the joints, shape (k, n).
+        ratio: R of the drive train, shape (n, n).
+    """
+    motor_rad = position * np.diag(ratio)
+    for motor in np.flatnonzero(np.count_nonzero(ratio, axis=1) > 1).tolist():
+        turned = position @ ratio[motor]
+        largest = float(np.max(np.abs(position) @ np.abs(ratio[motor])))
+        # The sum over joints has rounding errors, with which nothing would repeat.
+        motor_rad[:, motor] = np.round(turned / largest, ROUNDED_DIGITS) * largest if largest else turned
+    return motor_rad
+
+
+def _joint_faults(
+    position: FloatArray, ratio: FloatArray, rate_hz: float, motors: Set[int]
+) -> Iterator[ChannelFault]:
+    """Judge joints that several motors turn, where nothing is wrong with these: their own encoders may be read."""
+    turned_by = np.abs(np.linalg.inv(ratio)) > 0.0
+    for joint in np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist():
+        if not motors & set(np.flatnonzero(turned_by[joint]).tolist()):
+            yield from _position_faults(position[:, joint], joint, rate_hz, JOINT_UNIT)
+
+
+def refused_fault(faults: Sequence[ChannelFault]) -> ChannelFault | None:
+    """Return the first fault that nothing mends, None without one."""
+    for one in faults:
+        if one.is_refused:
+            return one
+    return None
+
+
+def filled_samples(
+    faults: Sequence[ChannelFault], quantity: Quantity, shape: tuple[int, ...], to_joint: FloatArray | None = None
+) -> BoolArray:
+    """Samples of each column that are to be filled in, shape (k, n).
+
+    Args:
+        faults: of the recording.
+        quantity: of the columns.
+        shape: of the columns.
+        to_joint: R⁻¹, where the columns are the joints that the motors turn, shape (n, n).
+    """
+    return _marked(faults, quantity, shape, to_joint, is_filled=True)
+
+
+def without_glitches(position: FloatArray, faults: Sequence[ChannelFault], ratio: FloatArray | None) -> FloatArray:
+    """Return positions, shape (k, n), with their glitches filled in; the same array without any.
+
+    Args:
+        position: as of `find_faults`.
+        faults: of it.
+        ratio: as of `find_faults`.
+    """
+    to_joint = None if ratio is None else np.asarray(np.linalg.inv(ratio), dtype=np.float64)
+    damaged = filled_samples(faults, Quantity.POSITION, position.shape, to_joint)
+    if not np.any(damaged):
+        return position
+    columns = [fill_damaged(values, own, smooth=True) for values, own in zip(position.T, damaged.T, strict=True)]
+    return np.stack(columns, axis=1)
+
+
+def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int) -> BoolArray:
+    """Samples of each axis that are to be left out, shape (k, n).
+
+    Every torque depends on every position. Around a position that is not known, filters spread what is assumed of it.
+
+    Args:
+        faults: of the recording.
+        shape: of its positions.
+        margin: samples before and after those of a position.
+    """
+    out = _marked(faults, Quantity.CURRENT, shape, None, is_filled=False)
+    for one in faults:
+        if one.quantity is Quantity.POSITION and not one.is_filled:
+            for first, end in one.stretches.tolist():
+                out[max(first - margin, 0) : end + margin] = True
+    return out
+
+
+def _marked(
+    faults: Sequence[ChannelFault],
+    quantity: Quantity,
+    shape: tuple[int, ...],
+    to_joint: FloatArray | None,
+    *,
+    is_filled: bool,
+) -> BoolArray:
+    marked = np.zeros(shape, dtype=np.bool_)
+    for one in faults:
+        if one.quantity is not quantity or one.is_filled is not is_filled:
+            continue
+        columns = np.array([one.axis])
+        if to_joint is not None:
+            columns = np.union1d(columns, np.flatnonzero(to_joint[:, one.axis]))
+        for first, end in one.stretches.tolist():
+            marked[first:end, columns] = True
+    return marked
+
+
+def _readings(values: FloatArray, rate_hz: float) -> Readings:
+    """The readings of a channel, without those that were held."""
+    held = held_channel(values, rate_hz)
+    sample = np.arange(len(values)) if held is None else np.flatnonzero(~held)
+    return Readings(values[sample], sample, rate_hz)
+
+
+def _position_faults(values: FloatArray, axis: int, rate_hz: float, unit: str) -> Iterator[ChannelFault]:
+    readings = _readings(values, rate_hz)
+
+    def fault(kind: FaultKind, stretches: IntArray, size: float) -> ChannelFault:
+        return ChannelFault(
+            kind, Quantity.POSITION, axis, stretches, size, len(values), rate_hz, readings.count, unit
+        )
+
+    jumps = find_jumps(readings, is_position=True)
+    whole = wrap_size(readings, jumps)
+    if whole is not None:
+        yield fault(FaultKind.WRAPPING, _steps(readings, jumps.step), whole)
+        return
+    if jumps.glitches:
+        yield fault(FaultKind.GLITCH, _glitched(readings, jumps), _largest(jumps))
+    frozen = frozen_position(_without(readings, jumps))
+    if len(frozen):
+        kind = FaultKind.CLIPPED if at_limit(readings, frozen) else FaultKind.FROZEN
+        yield fault(kind, frozen, 0.0)
+    steps = np.abs(np.diff(readings.values))
+    usual = float(np.percentile(steps, USUAL_PERCENTILE)) if len(steps) else 0.0
+    lost = np.abs(jumps.step_size) > LOST_PLACE * usual
+    beside = np.isin(readings.sample[jumps.step] + 1, frozen) | np.isin(readings.sample[jumps.step + 1], frozen)
+    lost &= ~beside
+    if np.any(lost):
+        size = float(np.max(np.abs(jumps.step_size[lost])))
+        yield fault(FaultKind.DISPLACED, _steps(readings, jumps.step[lost]), size)
+
+
+def _current_faults(
+    values: FloatArray, motor_rad: FloatArray, axis: int, rate_hz: float
+) -> Iterator[ChannelFault]:
+    readings = _readings(values, rate_hz)
+
+    def fault(kind: FaultKind, stretches: IntArray, size: float) -> ChannelFault:
+        return ChannelFault(kind, Quantity.CURRENT, axis, stretches, size, len(values), rate_hz, readings.count)
+
+    upper = is_split(readings.values)
+    if upper is not None:
+        step = np.flatnonzero(np.diff(upper))
+        sizes = np.abs(np.diff(readings.values)[step])
+        yield fault(FaultKind.UNSIGNED, _steps(readings, step), float(np.median(sizes)))
+        return
+    jumps = find_jumps(readings, is_position=False)
+    whole = wrap_size(readings, jumps)
+    if whole is not None:
+        yield fault(FaultKind.WRAPPING, _steps(readings, jumps.step), whole)
+        return
+    if jumps.glitches:
+        yield fault(FaultKind.GLITCH, _glitched(readings, jumps), _largest(jumps))
+    frozen = frozen_current(_without(readings, jumps), motor_rad)
+    if len(frozen):
+        yield fault(FaultKind.FROZEN, frozen, 0.0)
+
+
+def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
+    after = np.append(readings.sample, readings.sample[-1] + 1)
+    return np.array([(after[one.first], after[one.end]) for one in jumps.glitches], dtype=np.int64)
+
+
+def _largest(jumps: Jumps) -> float:
+    return max(one.size for one in jumps.glitches)
+
+
+def _steps(readings: Readings, step: IntArray) -> IntArray:
+    """The sample after each step, as a stretch."""
+    after = readings.sample[step + 1]
+    return np.column_stack((after, after + 1))
+
+
+def _without(readings: Readings, jumps: Jumps) -> Readings:
+    """Readings without those that are glitches."""
+    is_right = np.ones(len(readings.values), dtype=np.bool_)
+    for one in jumps.glitches:
+        is_right[one.first : one.end] = False
+    return Readings(readings.values[is_right], readings.sample[is_right], readings.rate_hz)
+
+
+def _is_in_use(fault: ChannelFault, usable: BoolArray) -> bool:
+    """Whether some sample of a fault, and the one before, was to be used."""
+    for first, end in fault.stretches.tolist():
+        if bool(np.all(usable[max(first - 1, 0) : end, fault.axis])):
+            return True
+    return False
