@@ -30,9 +30,11 @@ from daq.errors import ConfigurationInconsistent, TableUnfit
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
+from daq.log.column_faults import fault_remarks, require_mendable, sound_columns
 from daq.log.container import MAGIC
-from daq.log.conversion import check_limits, scaling, unwrapped
+from daq.log.conversion import SiScaling, check_limits, scaling, unwrapped
 from daq.log.csv_table import read_csv
+from daq.log.impossible import impossible_current
 from daq.log.mat_table import read_mat
 from daq.log.mcap_bag import ZSTD_MAGIC
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics, Timing
@@ -46,6 +48,7 @@ from daq.log.plausibility import (
     check_steps,
     check_velocity,
     in_si,
+    require_changing,
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
@@ -97,35 +100,41 @@ def import_recording(
     table = files[wanted.position.file]
     position = table.take(wanted.position.columns)
     current = files[wanted.current.file].take(wanted.current.columns)
-    check_current(current, wanted, files[wanted.current.file])
+    require_changing(position, current, wanted, files[wanted.current.file])
     if wanted.position.unit is PositionUnit.COUNTS:
         check_counts(position, wanted, table)
     clock = None
     rate_hz = wanted.rate_hz
+    row = np.arange(len(position))
     if wanted.time is not None:
         numbers = np.hstack([file.values for file in files.values()])
         clock = clock_of(files[wanted.time.file], wanted.time, numbers)
         rate_hz = clock.timing.rate_hz
-        position = position[clock.row]
+        row = clock.row
     assert rate_hz is not None  # load_import requires one of the two
-    counts, count_rad = _counts(wanted, cell, position, clock)
-    factors = wanted.current.factors(cell.axis_names)
-    raw, unit = quantise(on_clock(current, clock) * np.array(factors))
-    readback = Readback(
-        tuple(
-            AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
-            for i, axis in enumerate(cell.axes)
-        )
-    )
-    scale = scaling(cell, readback)
-    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
-    joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
+    sound = sound_columns(position, current, wanted, files, row, rate_hz)
+    check_current(sound.current, wanted, files[wanted.current.file])
+    is_resampled = clock is not None and clock.timing.resampled
+    if is_resampled or impossible_current(current) is not None:
+        current = sound.current
+    if is_resampled:
+        position = sound.position
+    checked = _converted(wanted, cell, sound.position[row], sound.current, clock)
+    kept = checked
+    if sound.is_mended and not is_resampled:
+        kept = _converted(wanted, cell, position[row], current, clock)
+    counts = kept.counts
+    raw = kept.current_raw
+    readback = kept.readback
+    scale = kept.scale
+    joint_rad = checked.joint_rad
     check_limits(str(table.path), joint_rad, cell)
     check_motion(str(table.path), joint_rad, cell)
     check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    require_mendable(sound.faults, wanted, files, row, displaced=True)
     check_speed(str(table.path), joint_rad, rate_hz, cell)
     check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
-    warn_of_unsigned(wanted.name, joint_rad, raw * unit, rate_hz, cell)
+    warn_of_unsigned(wanted.name, joint_rad, checked.current_raw * checked.scale.current_per_unit, rate_hz, cell)
     digests = {name: file.digest for name, file in files.items()}
     slow = _slow(wanted, cell, files, clock, rate_hz)
     started_ns, started_wall_ns, timing = _start(wanted, files, clock)
@@ -150,7 +159,39 @@ def import_recording(
             log.readings(_readings(slow, cycle, time_ns))
             log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
         log.conclude(valid=True)
-    return Imported(log.statistics, timing, tuple(remark for file in files.values() for remark in file.remarks))
+    remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks += fault_remarks(sound, wanted, files, row, cell)
+    return Imported(log.statistics, timing, tuple(remarks))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converted:
+    """Columns of a file as a log has them, and as a fit reads them."""
+
+    counts: IntArray  #: positions of the motors, shape (k, n)
+    current_raw: IntArray  #: shape (k, n)
+    readback: Readback  #: with the unit of each
+    scale: SiScaling
+    joint_rad: FloatArray  #: positions of the joints [rad; m of a prismatic joint], shape (k, n)
+
+
+def _converted(
+    wanted: ImportDescription, cell: Cell, position: FloatArray, current: FloatArray, clock: Clock | None
+) -> Converted:
+    """Convert positions of the rows that are used, and currents of all rows."""
+    counts, count_rad = _counts(wanted, cell, position, clock)
+    factors = wanted.current.factors(cell.axis_names)
+    raw, unit = quantise(on_clock(current, clock) * np.array(factors))
+    readback = Readback(
+        tuple(
+            AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
+            for i, axis in enumerate(cell.axes)
+        )
+    )
+    scale = scaling(cell, readback)
+    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
+    joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
+    return Converted(counts, raw, readback, scale, joint_rad)
 
 
 def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:

@@ -19,6 +19,7 @@ from daq.log.message import RawArray
 from daq.log.metadata import Readback, RunStatistics
 from daq.log.reader import LogHead, LogReader, SampleBlock, SampleChecks, joined
 from drivers.messages import Sample
+from ident.data.channel_faults import find_faults
 
 
 def motion_reason(
@@ -45,7 +46,9 @@ def motion_reason(
     scale = scaling(cell, readback)
     position_rad = scale.joint_position(continuous_counts(position_counts, readback))
     known = scale.joints_known(answers(missing, len(cell.axes)))
-    fault = motion_fault("", cell, rate_hz, position_rad, current_raw * scale.current_per_unit, known)
+    current = current_raw * scale.current_per_unit
+    faults = find_faults(position_rad, current, rate_hz, cell.ratio, known)
+    fault = motion_fault("", cell, rate_hz, position_rad, current, known, faults)
     if fault is None:
         return ""
     axis = fault.subject.removeprefix(", ")

@@ -18,7 +18,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.frozen import at_limit, frozen_current, frozen_position
 from ident.data.glitches import Jumps, Readings, find_jumps, is_split, wrap_size
-from ident.data.held import fill_damaged, held_channel
+from ident.data.held import fill_damaged, held_channel, longest_smooth
 
 LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
 LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
@@ -76,14 +76,19 @@ class ChannelFault:
         """Whether the recording cannot be used."""
         if self.kind is FaultKind.GLITCH:
             return self.share > LARGEST_GLITCHED
-        if self.kind in {FaultKind.FROZEN, FaultKind.CLIPPED}:
+        if self.is_left_out:
             return self.share > LARGEST_FROZEN
         return True
 
     @property
     def is_filled(self) -> bool:
-        """Whether its samples are filled in; those of others are left out."""
+        """Whether its samples are filled in."""
         return self.kind is FaultKind.GLITCH
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether its samples are left out."""
+        return self.kind in {FaultKind.FROZEN, FaultKind.CLIPPED}
 
 
 def find_faults(
@@ -150,18 +155,27 @@ def _joint_faults(
             yield from _position_faults(position[:, joint], joint, rate_hz, JOINT_UNIT)
 
 
-def refused_fault(faults: Sequence[ChannelFault]) -> ChannelFault | None:
-    """Return the first fault that nothing mends, None without one."""
+def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> ChannelFault | None:
+    """Return the first fault that nothing mends, None without one.
+
+    Args:
+        faults: of the recording.
+        displaced: look for positions that go on displaced, of which the limits of the robot may say more; else for
+            all others.
+    """
     for one in faults:
-        if one.is_refused:
+        if one.is_refused and (one.kind is FaultKind.DISPLACED) is displaced:
             return one
     return None
 
 
-def filled_samples(
+def replaced_samples(
     faults: Sequence[ChannelFault], quantity: Quantity, shape: tuple[int, ...], to_joint: FloatArray | None = None
 ) -> BoolArray:
-    """Samples of each column that are to be filled in, shape (k, n).
+    """Samples of each column that are to be replaced by those around them, shape (k, n).
+
+    Currents that are left out stay as they are: nothing depends on them. Positions do not, because filters would spread
+    their steps.
 
     Args:
         faults: of the recording.
@@ -169,22 +183,41 @@ def filled_samples(
         shape: of the columns.
         to_joint: R⁻¹, where the columns are the joints that the motors turn, shape (n, n).
     """
-    return _marked(faults, quantity, shape, to_joint, is_filled=True)
+    marked = np.zeros(shape, dtype=np.bool_)
+    for one in faults:
+        is_replaced = one.is_filled or (one.quantity is Quantity.POSITION and one.is_left_out)
+        if one.quantity is not quantity or not is_replaced:
+            continue
+        columns = np.array([one.axis])
+        if to_joint is not None:
+            columns = np.union1d(columns, np.flatnonzero(to_joint[:, one.axis]))
+        for first, end in one.stretches.tolist():
+            marked[first:end, columns] = True
+    return marked
 
 
-def without_glitches(position: FloatArray, faults: Sequence[ChannelFault], ratio: FloatArray | None) -> FloatArray:
-    """Return positions, shape (k, n), with their glitches filled in; the same array without any.
+def mended(
+    values: FloatArray,
+    faults: Sequence[ChannelFault],
+    rate_hz: float,
+    ratio: FloatArray | None = None,
+    quantity: Quantity = Quantity.POSITION,
+) -> FloatArray:
+    """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
 
     Args:
-        position: as of `find_faults`.
-        faults: of it.
-        ratio: as of `find_faults`.
+        values: positions or currents, as of `find_faults`.
+        faults: of the recording.
+        rate_hz: sampling rate.
+        ratio: as of `find_faults`, for positions.
+        quantity: of the values.
     """
     to_joint = None if ratio is None else np.asarray(np.linalg.inv(ratio), dtype=np.float64)
-    damaged = filled_samples(faults, Quantity.POSITION, position.shape, to_joint)
-    if not np.any(damaged):
-        return position
-    columns = [fill_damaged(values, own, smooth=True) for values, own in zip(position.T, damaged.T, strict=True)]
+    replaced = replaced_samples(faults, quantity, values.shape, to_joint)
+    if not np.any(replaced):
+        return values
+    longest = longest_smooth(rate_hz) if quantity is Quantity.POSITION else 0
+    columns = [fill_damaged(own, wrong, longest) for own, wrong in zip(values.T, replaced.T, strict=True)]
     return np.stack(columns, axis=1)
 
 
@@ -198,32 +231,16 @@ def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], mar
         shape: of its positions.
         margin: samples before and after those of a position.
     """
-    out = _marked(faults, Quantity.CURRENT, shape, None, is_filled=False)
+    out = np.zeros(shape, dtype=np.bool_)
     for one in faults:
-        if one.quantity is Quantity.POSITION and not one.is_filled:
-            for first, end in one.stretches.tolist():
-                out[max(first - margin, 0) : end + margin] = True
-    return out
-
-
-def _marked(
-    faults: Sequence[ChannelFault],
-    quantity: Quantity,
-    shape: tuple[int, ...],
-    to_joint: FloatArray | None,
-    *,
-    is_filled: bool,
-) -> BoolArray:
-    marked = np.zeros(shape, dtype=np.bool_)
-    for one in faults:
-        if one.quantity is not quantity or one.is_filled is not is_filled:
+        if not one.is_left_out:
             continue
-        columns = np.array([one.axis])
-        if to_joint is not None:
-            columns = np.union1d(columns, np.flatnonzero(to_joint[:, one.axis]))
         for first, end in one.stretches.tolist():
-            marked[first:end, columns] = True
-    return marked
+            if one.quantity is Quantity.POSITION:
+                out[max(first - margin, 0) : end + margin] = True
+            else:
+                out[first:end, one.axis] = True
+    return out
 
 
 def _readings(values: FloatArray, rate_hz: float) -> Readings:

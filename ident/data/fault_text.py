@@ -9,6 +9,7 @@ from ident.data.channel_faults import ChannelFault, FaultKind, Quantity
 from ident.errors import Diagnosis, ReadingsDamaged
 
 DAMAGED, FROZEN = "readings-damaged", "readings-frozen"  #: Names of diagnoses
+COUNTS = "counts"  #: Unit of a channel that has one a count
 NEAR_BITS = 0.02  #: Largest distance of the size of a counter from a power of two, in bits
 
 
@@ -39,10 +40,10 @@ def fault_diagnosis(run: str, fault: ChannelFault, axis: str) -> Diagnosis:
         axis: name of the axis.
     """
     name = DAMAGED if fault.is_filled else FROZEN
-    return Diagnosis(name, (run,), (axis,), f"{found(fault)}; {mended(fault)}", expected(fault), remedy(fault))
+    return Diagnosis(name, (run,), (axis,), f"{found(fault)}; {what_is_done(fault)}", expected(fault), remedy(fault))
 
 
-def mended(fault: ChannelFault) -> str:
+def what_is_done(fault: ChannelFault) -> str:
     """Say what is done with the samples of a fault."""
     return "these samples were filled in" if fault.is_filled else "these samples were left out"
 
@@ -108,7 +109,8 @@ def _sized(fault: ChannelFault) -> str:
 
 def _bits(fault: ChannelFault) -> str:
     """Say how many bits a counter has, where its range is a power of two in counts; else nothing."""
-    if not fault.count > 0.0:
+    count = 1.0 if fault.unit == COUNTS else fault.count
+    if not count > 0.0:
         return ""
-    bits = log2(fault.size / fault.count)
+    bits = log2(fault.size / count)
     return f" of {round(bits)} bits" if abs(bits - round(bits)) < NEAR_BITS and bits > 7.0 else ""

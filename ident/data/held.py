@@ -116,7 +116,7 @@ def without_held(
         damaged = np.zeros(len(values), dtype=np.bool_)
     held = held_channel(values, rate_hz)
     if held is None:
-        return Channel(fill_damaged(values, damaged, smooth=smooth))
+        return Channel(fill_damaged(values, damaged, longest_smooth(rate_hz) if smooth else 0))
     share = _share_held(values, held)
     sample = np.arange(len(values))
     read = ~held & ~damaged
@@ -132,29 +132,35 @@ def without_held(
     return Channel(out, share, hold_s)
 
 
-def fill_damaged(values: FloatArray, damaged: BoolArray, *, smooth: bool) -> FloatArray:
+def longest_smooth(rate_hz: float) -> int:
+    """Most samples that a curve is laid through: beyond LONGEST_HOLD_S it would be made up."""
+    return max(BESIDE, round(LONGEST_HOLD_S * rate_hz))
+
+
+def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int) -> FloatArray:
     """Fill in samples that are no readings, by those around them; the same array without any.
 
     Args:
         values: of a channel, shape (k,).
         damaged: shape (k,).
-        smooth: by the cubic that fits BESIDE readings on either side best, else by straight lines.
+        longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on either side best,
+            others by a straight line.
     """
-    if not np.any(damaged):
+    if not np.any(damaged) or np.all(damaged):
         return values
     out = values.copy()
     right = np.flatnonzero(~damaged)
     wrong = np.flatnonzero(damaged)
     out[wrong] = np.interp(wrong, right, values[right])
-    if not smooth:
-        return out
     for block in np.split(wrong, np.flatnonzero(np.diff(wrong) > 1) + 1):
+        if len(block) > longest:
+            continue
         wide = max(BESIDE, len(block))
         place = int(np.searchsorted(right, block[0]))
         near = right[max(place - wide, 0) : place + wide]
         is_between = near[0] < block[0] and near[-1] > block[-1]
         # Beyond the first and the last reading a cubic goes astray.
-        degree = 3 if is_between and len(near) >= BESIDE else 1
+        degree = 3 if is_between and len(near) > BESIDE else 1
         middle = float(np.mean(near))
         fitted = np.polyfit(near - middle, values[near], degree)
         out[block] = np.polyval(fitted, block - middle)
