@@ -30,7 +30,7 @@ from daq.errors import ConfigurationInconsistent, TableUnfit
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
-from daq.log.column_faults import fault_remarks, require_mendable, sound_columns
+from daq.log.column_faults import UsedRows, fault_remarks, require_mendable, sound_columns
 from daq.log.container import MAGIC
 from daq.log.conversion import SiScaling, check_limits, scaling, unwrapped
 from daq.log.csv_table import read_csv
@@ -56,6 +56,7 @@ from daq.log.table import Reader, Table
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
+from ident.data.channel_faults import ChannelFault
 from ident.model.bodies import Payload
 
 FEWEST_ROWS = 3  #: Rows of a recording; fewer have neither a rate nor a motion
@@ -97,47 +98,12 @@ def import_recording(
     _check_cell(wanted, cell, description)
     files = _read_tables(wanted, data)
     check_sizes(wanted, cell, files)
-    table = files[wanted.position.file]
-    position = table.take(wanted.position.columns)
-    current = files[wanted.current.file].take(wanted.current.columns)
-    require_changing(position, current, wanted, files[wanted.current.file])
-    if wanted.position.unit is PositionUnit.COUNTS:
-        check_counts(position, wanted, table)
-    clock = None
-    rate_hz = wanted.rate_hz
-    row = np.arange(len(position))
-    if wanted.time is not None:
-        numbers = np.hstack([file.values for file in files.values()])
-        clock = clock_of(files[wanted.time.file], wanted.time, numbers)
-        rate_hz = clock.timing.rate_hz
-        row = clock.row
-    assert rate_hz is not None  # load_import requires one of the two
-    sound = sound_columns(position, current, wanted, files, row, rate_hz)
-    check_current(sound.current, wanted, files[wanted.current.file])
-    is_resampled = clock is not None and clock.timing.resampled
-    if is_resampled or impossible_current(current) is not None:
-        current = sound.current
-    if is_resampled:
-        position = sound.position
-    checked = _converted(wanted, cell, sound.position[row], sound.current, clock)
-    kept = checked
-    if sound.is_mended and not is_resampled:
-        kept = _converted(wanted, cell, position[row], current, clock)
-    counts = kept.counts
-    raw = kept.current_raw
-    readback = kept.readback
-    scale = kept.scale
-    joint_rad = checked.joint_rad
-    check_limits(str(table.path), joint_rad, cell)
-    check_motion(str(table.path), joint_rad, cell)
-    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
-    require_mendable(sound.faults, wanted, files, row, displaced=True)
-    check_speed(str(table.path), joint_rad, rate_hz, cell)
-    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
-    warn_of_unsigned(wanted.name, joint_rad, checked.current_raw * checked.scale.current_per_unit, rate_hz, cell)
+    recorded = _recorded(wanted, cell, files)
+    kept = recorded.kept
+    rate_hz = recorded.used.rate_hz
     digests = {name: file.digest for name, file in files.items()}
-    slow = _slow(wanted, cell, files, clock, rate_hz)
-    started_ns, started_wall_ns, timing = _start(wanted, files, clock)
+    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
+    started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
     run = RunInfo(
         run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
         rate_hz=rate_hz,
@@ -149,18 +115,18 @@ def import_recording(
         origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
         timing=timing,
     )
-    content = LogContent.of(cell, run, bundle(path), readback)
+    content = LogContent.of(cell, run, bundle(path), kept.readback)
     # A crash of an import loses no sample, so no clock is needed to flush in time.
-    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
-        stamp_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
+    with LogWriter(out, content, kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        stamp_ns = (started_ns + np.rint(np.arange(len(kept.counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
         silent = (0,) * len(cell.axes)
-        rows = zip(stamp_ns, counts.tolist(), raw.tolist(), strict=True)
+        rows = zip(stamp_ns, kept.counts.tolist(), kept.current_raw.tolist(), strict=True)
         for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
             log.readings(_readings(slow, cycle, time_ns))
             log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
         log.conclude(valid=True)
     remarks = [remark for file in files.values() for remark in file.remarks]
-    remarks += fault_remarks(sound, wanted, files, row, cell)
+    remarks += fault_remarks(recorded.faults, recorded.used)
     return Imported(log.statistics, timing, tuple(remarks))
 
 
@@ -173,6 +139,60 @@ class Converted:
     readback: Readback  #: with the unit of each
     scale: SiScaling
     joint_rad: FloatArray  #: positions of the joints [rad; m of a prismatic joint], shape (k, n)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """A recording that a robot can have made."""
+
+    used: UsedRows
+    clock: Clock | None  #: None without a time column
+    kept: Converted  #: what the log is to hold
+    faults: tuple[ChannelFault, ...]  #: readings that are none
+
+
+def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> Recorded:
+    """Judge and convert what the files hold.
+
+    Raises:
+        TableUnfit, PositionImplausible: the files cannot be used.
+    """
+    table = files[wanted.position.file]
+    currents = files[wanted.current.file]
+    position = table.take(wanted.position.columns)
+    current = currents.take(wanted.current.columns)
+    require_changing(position, current, wanted, currents)
+    if wanted.position.unit is PositionUnit.COUNTS:
+        check_counts(position, wanted, table)
+    clock = None
+    rate_hz = wanted.rate_hz
+    row = np.arange(len(position))
+    if wanted.time is not None:
+        numbers = np.hstack([file.values for file in files.values()])
+        clock = clock_of(files[wanted.time.file], wanted.time, numbers)
+        rate_hz = clock.timing.rate_hz
+        row = clock.row
+    assert rate_hz is not None  # load_import requires one of the two
+    used = UsedRows(row, None if clock is None else clock.time_s, rate_hz, wanted, files, cell)
+    sound = sound_columns(position, current, used)
+    check_current(sound.current, wanted, currents)
+    checked = _converted(wanted, cell, sound.position[row], sound.current, clock)
+    joint_rad = checked.joint_rad
+    check_limits(str(table.path), joint_rad, cell)
+    check_motion(str(table.path), joint_rad, cell)
+    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    require_mendable(sound.faults, used, displaced=True)
+    check_speed(str(table.path), joint_rad, rate_hz, cell)
+    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
+    current_a = checked.current_raw * checked.scale.current_per_unit
+    warn_of_unsigned(wanted.name, joint_rad, current_a, rate_hz, cell)
+    kept = checked
+    is_resampled = clock is not None and clock.timing.resampled
+    if sound.faults and not is_resampled:
+        # A fit mends them alike; but an absurd number would make the counts of its column too coarse.
+        is_absurd = impossible_current(current) is not None
+        kept = _converted(wanted, cell, position[row], sound.current if is_absurd else current, clock)
+    return Recorded(used, clock, kept, sound.faults)
 
 
 def _converted(

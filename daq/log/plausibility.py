@@ -1,8 +1,8 @@
 """Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column.
 
 Each check names the file, the column or axis, what was found, and the setting of the import description to correct. A
-step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`), and so are readings that are none
-(`daq.log.column_faults`).
+step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`), and so are readings that are
+none (`daq.log.column_faults`).
 """
 
 from __future__ import annotations

@@ -1,23 +1,23 @@
 """One judgement of the channels of a recording: what is wrong with single numbers, and whether it can be mended.
 
 Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A stretch in which a
-channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign, and
-an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which
-too much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
+channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign,
+and an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which too
+much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
 sign `ident.data.unsigned_current`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.frozen import at_limit, frozen_current, frozen_position
-from ident.data.glitches import Jumps, Readings, find_jumps, is_split, wrap_size
+from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
 from ident.data.held import fill_damaged, held_channel, longest_smooth
 
 LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
@@ -116,14 +116,13 @@ def find_faults(
     if len(position) < 2:
         return ()
     found: list[ChannelFault] = []
-    count = position.shape[1]
     read = position if ratio is None else motor_positions(position, ratio)
-    for axis in range(count):
-        found += _position_faults(read[:, axis], axis, rate_hz, unit)
+    for axis, readings in enumerate(_readings(read, rate_hz)):
+        found += _position_faults(readings, Place(Quantity.POSITION, axis, len(position), unit))
     if ratio is not None:
         found += _joint_faults(position, ratio, rate_hz, {one.axis for one in found})
-    for axis in range(current.shape[1]):
-        found += _current_faults(current[:, axis], read[:, axis], axis, rate_hz)
+    for axis, readings in enumerate(_readings(current, rate_hz)):
+        found += _current_faults(readings, read[:, axis], Place(Quantity.CURRENT, axis, len(position)))
     if usable is None:
         return tuple(found)
     return tuple(one for one in found if _is_in_use(one, usable))
@@ -145,14 +144,13 @@ def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
     return motor_rad
 
 
-def _joint_faults(
-    position: FloatArray, ratio: FloatArray, rate_hz: float, motors: Set[int]
-) -> Iterator[ChannelFault]:
+def _joint_faults(position: FloatArray, ratio: FloatArray, rate_hz: float, motors: Set[int]) -> Iterator[ChannelFault]:
     """Judge joints that several motors turn, where nothing is wrong with these: their own encoders may be read."""
     turned_by = np.abs(np.linalg.inv(ratio)) > 0.0
-    for joint in np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist():
+    coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
+    for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
         if not motors & set(np.flatnonzero(turned_by[joint]).tolist()):
-            yield from _position_faults(position[:, joint], joint, rate_hz, JOINT_UNIT)
+            yield from _position_faults(readings, Place(Quantity.POSITION, joint, len(position), JOINT_UNIT))
 
 
 def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> ChannelFault | None:
@@ -170,7 +168,7 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
 
 def replaced_samples(
-    faults: Sequence[ChannelFault], quantity: Quantity, shape: tuple[int, ...], to_joint: FloatArray | None = None
+    faults: Sequence[ChannelFault], quantity: Quantity, shape: tuple[int, ...], ratio: FloatArray | None = None
 ) -> BoolArray:
     """Samples of each column that are to be replaced by those around them, shape (k, n).
 
@@ -181,8 +179,9 @@ def replaced_samples(
         faults: of the recording.
         quantity: of the columns.
         shape: of the columns.
-        to_joint: R⁻¹, where the columns are the joints that the motors turn, shape (n, n).
+        ratio: R of the drive train, where the columns are joints, shape (n, n).
     """
+    to_joint = None if ratio is None else np.linalg.inv(ratio)
     marked = np.zeros(shape, dtype=np.bool_)
     for one in faults:
         is_replaced = one.is_filled or (one.quantity is Quantity.POSITION and one.is_left_out)
@@ -202,6 +201,7 @@ def mended(
     rate_hz: float,
     ratio: FloatArray | None = None,
     quantity: Quantity = Quantity.POSITION,
+    time: FloatArray | None = None,
 ) -> FloatArray:
     """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
 
@@ -211,13 +211,13 @@ def mended(
         rate_hz: sampling rate.
         ratio: as of `find_faults`, for positions.
         quantity: of the values.
+        time: of each sample, in any unit, shape (k,); None for a constant rate.
     """
-    to_joint = None if ratio is None else np.asarray(np.linalg.inv(ratio), dtype=np.float64)
-    replaced = replaced_samples(faults, quantity, values.shape, to_joint)
+    replaced = replaced_samples(faults, quantity, values.shape, ratio)
     if not np.any(replaced):
         return values
     longest = longest_smooth(rate_hz) if quantity is Quantity.POSITION else 0
-    columns = [fill_damaged(own, wrong, longest) for own, wrong in zip(values.T, replaced.T, strict=True)]
+    columns = [fill_damaged(own, wrong, longest, time) for own, wrong in zip(values.T, replaced.T, strict=True)]
     return np.stack(columns, axis=1)
 
 
@@ -243,32 +243,55 @@ def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], mar
     return out
 
 
-def _readings(values: FloatArray, rate_hz: float) -> Readings:
-    """The readings of a channel, without those that were held."""
-    held = held_channel(values, rate_hz)
-    sample = np.arange(len(values)) if held is None else np.flatnonzero(~held)
-    return Readings(values[sample], sample, rate_hz)
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A channel of a recording."""
 
+    quantity: Quantity
+    axis: int  #: index
+    samples: int  #: of the recording
+    unit: str = ""  #: of the channel, for messages
 
-def _position_faults(values: FloatArray, axis: int, rate_hz: float, unit: str) -> Iterator[ChannelFault]:
-    readings = _readings(values, rate_hz)
-
-    def fault(kind: FaultKind, stretches: IntArray, size: float) -> ChannelFault:
+    def fault(self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0) -> ChannelFault:
+        """Make a fault of this channel."""
         return ChannelFault(
-            kind, Quantity.POSITION, axis, stretches, size, len(values), rate_hz, readings.count, unit
+            kind,
+            self.quantity,
+            self.axis,
+            stretches,
+            size,
+            self.samples,
+            readings.rate_hz,
+            readings.count,
+            self.unit,
         )
 
+
+def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
+    """Yield the readings of each channel, shape (k, c), without those that were held.
+
+    A channel that hardly changes is taken to be as fine as the coarsest of the others.
+    """
+    counts = [smallest_change(values) for values in channels.T]
+    coarsest = max((count for count in counts if count is not None), default=0.0)
+    for values, count in zip(channels.T, counts, strict=True):
+        held = held_channel(values, rate_hz)
+        sample = np.arange(len(values)) if held is None else np.flatnonzero(~held)
+        yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
+
+
+def _position_faults(readings: Readings, place: Place) -> Iterator[ChannelFault]:
     jumps = find_jumps(readings, is_position=True)
     whole = wrap_size(readings, jumps)
     if whole is not None:
-        yield fault(FaultKind.WRAPPING, _steps(readings, jumps.step), whole)
+        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
         return
     if jumps.glitches:
-        yield fault(FaultKind.GLITCH, _glitched(readings, jumps), _largest(jumps))
+        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
     frozen = frozen_position(_without(readings, jumps))
     if len(frozen):
         kind = FaultKind.CLIPPED if at_limit(readings, frozen) else FaultKind.FROZEN
-        yield fault(kind, frozen, 0.0)
+        yield place.fault(kind, readings, frozen)
     steps = np.abs(np.diff(readings.values))
     usual = float(np.percentile(steps, USUAL_PERCENTILE)) if len(steps) else 0.0
     lost = np.abs(jumps.step_size) > LOST_PLACE * usual
@@ -276,33 +299,26 @@ def _position_faults(values: FloatArray, axis: int, rate_hz: float, unit: str) -
     lost &= ~beside
     if np.any(lost):
         size = float(np.max(np.abs(jumps.step_size[lost])))
-        yield fault(FaultKind.DISPLACED, _steps(readings, jumps.step[lost]), size)
+        yield place.fault(FaultKind.DISPLACED, readings, _steps(readings, jumps.step[lost]), size)
 
 
-def _current_faults(
-    values: FloatArray, motor_rad: FloatArray, axis: int, rate_hz: float
-) -> Iterator[ChannelFault]:
-    readings = _readings(values, rate_hz)
-
-    def fault(kind: FaultKind, stretches: IntArray, size: float) -> ChannelFault:
-        return ChannelFault(kind, Quantity.CURRENT, axis, stretches, size, len(values), rate_hz, readings.count)
-
+def _current_faults(readings: Readings, motor_rad: FloatArray, place: Place) -> Iterator[ChannelFault]:
     upper = is_split(readings.values)
     if upper is not None:
         step = np.flatnonzero(np.diff(upper))
         sizes = np.abs(np.diff(readings.values)[step])
-        yield fault(FaultKind.UNSIGNED, _steps(readings, step), float(np.median(sizes)))
+        yield place.fault(FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes)))
         return
     jumps = find_jumps(readings, is_position=False)
     whole = wrap_size(readings, jumps)
     if whole is not None:
-        yield fault(FaultKind.WRAPPING, _steps(readings, jumps.step), whole)
+        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
         return
     if jumps.glitches:
-        yield fault(FaultKind.GLITCH, _glitched(readings, jumps), _largest(jumps))
+        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
     frozen = frozen_current(_without(readings, jumps), motor_rad)
     if len(frozen):
-        yield fault(FaultKind.FROZEN, frozen, 0.0)
+        yield place.fault(FaultKind.FROZEN, readings, frozen)
 
 
 def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
@@ -325,12 +341,11 @@ def _without(readings: Readings, jumps: Jumps) -> Readings:
     is_right = np.ones(len(readings.values), dtype=np.bool_)
     for one in jumps.glitches:
         is_right[one.first : one.end] = False
-    return Readings(readings.values[is_right], readings.sample[is_right], readings.rate_hz)
+    return replace(readings, values=readings.values[is_right], sample=readings.sample[is_right])
 
 
 def _is_in_use(fault: ChannelFault, usable: BoolArray) -> bool:
-    """Whether some sample of a fault, and the one before, was to be used."""
-    for first, end in fault.stretches.tolist():
-        if bool(np.all(usable[max(first - 1, 0) : end, fault.axis])):
-            return True
-    return False
+    """Whether all samples of some stretch of a fault, and the one before, were to be used."""
+    unused = np.cumsum(~usable[:, fault.axis])
+    before = np.maximum(fault.stretches[:, 0] - 2, 0)
+    return bool(np.any(unused[fault.stretches[:, 1] - 1] == unused[before]))

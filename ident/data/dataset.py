@@ -97,7 +97,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         position,
         current,
         rate,
-        replaced_samples(faults, Quantity.POSITION, shape, np.linalg.inv(drive_train.ratio)),
+        replaced_samples(faults, Quantity.POSITION, shape, drive_train.ratio),
         replaced_samples(faults, Quantity.CURRENT, shape),
     )
     raw = np.ascontiguousarray(position.T)

@@ -90,8 +90,8 @@ def remedy(fault: ChannelFault) -> str:
     match fault.kind:
         case FaultKind.WRAPPING if is_position:
             return (
-                "record or export a counter of all turns (of 32 bits), or make the column continuous: nothing in it says "
-                "in which turn it began"
+                "record or export a counter of all turns (of 32 bits), or unwrap the column: nothing in it says in "
+                "which turn it began"
             )
         case FaultKind.WRAPPING | FaultKind.UNSIGNED:
             return "read the object or the column as a signed number of enough bits, and record or import again"

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.glitches import ROUNDING, SUSPECT_PERCENTILE, Readings
+from ident.data.glitches import SUSPECT_PERCENTILE, Readings
+from ident.data.held import ROUNDING
 
 LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
 LEAST_CURRENT_S = 0.1  #: Likewise of a current
@@ -91,10 +92,9 @@ def at_limit(readings: Readings, stretches: IntArray) -> bool:
         return False
     where = np.searchsorted(readings.sample, stretches[:, 0])
     values = readings.values[where]
-    for limit in (float(readings.values.max()), float(readings.values.min())):
-        if bool(np.all(values == limit)):
-            return True
-    return False
+    is_largest = bool(np.all(values == readings.values.max()))
+    is_smallest = bool(np.all(values == readings.values.min()))
+    return is_largest or is_smallest
 
 
 def covered(stretches: IntArray, samples: int) -> BoolArray:

@@ -22,6 +22,7 @@ SUSPECT_PERCENTILE = 98.0
 JUMP = 20.0
 """A jump differs from the steps around it by so many times their spread. Noise that is normal reaches 8 times."""
 JUMP_COUNTS = 20.0  #: And by so many counts: an encoder at rest may flicker
+LEAST_CHANGES = 20  #: Of a channel that shows its counts: those of an axis at rest may be glitches alone
 NEAR, FAR = 5, 14  #: Steps around a jump that are compared with it, from and to, on either side
 SHORT = 3  #: Readings that a glitch of any shape may have
 LONGEST_S = 0.05  #: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
@@ -39,14 +40,14 @@ class Readings:
     values: FloatArray  #: shape (r,)
     sample: IntArray  #: number of the sample of each, increasing, shape (r,)
     rate_hz: float  #: of the samples
+    count: float  #: smallest change that the channel can show
 
-    @property
-    def count(self) -> float:
-        """Smallest change of the channel; 0 for one that never changes."""
-        steps = np.abs(np.diff(self.values))
-        range_ = float(np.ptp(self.values)) if len(self.values) else 0.0
-        changed = steps[steps > ROUNDING * range_]
-        return float(changed.min()) if len(changed) else 0.0
+
+def smallest_change(values: FloatArray) -> float | None:
+    """Return the smallest change of a channel, shape (k,); None where it changes too seldom to show one."""
+    steps = np.abs(np.diff(values))
+    changed = steps[steps > ROUNDING * float(np.ptp(values))]
+    return float(changed.min()) if len(changed) >= LEAST_CHANGES else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +100,20 @@ def wrap_size(readings: Readings, jumps: Jumps) -> float | None:
     """
     if not len(jumps.step):
         return None
-    sizes = np.abs(jumps.step_size)
+    sizes = _sizes_of_wraps(readings, jumps.step)
     whole = float(np.median(sizes))
     is_same = np.abs(sizes - whole) <= SAME_SIZE * whole
     range_ = float(np.ptp(readings.values))
     is_seen = WRAP_SHARE * whole <= range_ <= (1.0 + SAME_SIZE) * whole
     # A single step may be that of an encoder that has lost its place.
     return whole if is_seen and np.count_nonzero(is_same) >= 2 and np.mean(is_same) > 0.5 else None
+
+
+def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
+    """Size of each step less the motion, by the two steps on either side of it, shape (s,)."""
+    steps = np.diff(readings.values)
+    beside = np.clip(step[:, None] + np.array([-2, -1, 1, 2]), 0, len(steps) - 1)
+    return np.abs(steps[step] - np.median(steps[beside], axis=1))
 
 
 def _jumps(readings: Readings) -> tuple[IntArray, FloatArray]:
@@ -126,10 +134,11 @@ def _jumps(readings: Readings) -> tuple[IntArray, FloatArray]:
     if not len(suspects):
         return nothing
     offsets = np.concatenate((np.arange(-FAR, -NEAR + 1), np.arange(NEAR, FAR + 1)))
-    places = np.clip(suspects[:, None] + offsets, 0, len(steps) - 1)
-    around = steps[places]
-    motion = np.median(around, axis=1)
-    spread = np.median(np.abs(around - motion[:, None]), axis=1)
+    places = suspects[:, None] + offsets
+    is_outside = (places < 0) | (places >= len(steps))
+    around = np.where(is_outside, np.nan, steps[np.clip(places, 0, len(steps) - 1)])
+    motion = np.nanmedian(around, axis=1)
+    spread = np.nanmedian(np.abs(around - motion[:, None]), axis=1)
     size = steps[suspects] - motion
     is_jump = np.abs(size) > JUMP * spread + JUMP_COUNTS * readings.count
     return suspects[is_jump], size[is_jump]
@@ -179,4 +188,3 @@ def is_split(values: FloatArray) -> BoolArray | None:
     share = float(np.mean(upper))
     is_both = min(share, 1.0 - share) >= LEAST_SPLIT
     return upper if is_empty and is_both and crossings >= 2 else None
-

@@ -101,9 +101,7 @@ def held_channel(values: FloatArray, rate_hz: float) -> BoolArray | None:
     return held if _share_held(values, held) >= LEAST_HELD else None
 
 
-def without_held(
-    values: FloatArray, rate_hz: float, *, smooth: bool, damaged: BoolArray | None = None
-) -> Channel:
+def without_held(values: FloatArray, rate_hz: float, *, smooth: bool, damaged: BoolArray | None = None) -> Channel:
     """Fill in the held samples of a channel, unless fewer than LEAST_HELD are held, and the damaged ones.
 
     Args:
@@ -137,7 +135,7 @@ def longest_smooth(rate_hz: float) -> int:
     return max(BESIDE, round(LONGEST_HOLD_S * rate_hz))
 
 
-def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int) -> FloatArray:
+def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int, time: FloatArray | None = None) -> FloatArray:
     """Fill in samples that are no readings, by those around them; the same array without any.
 
     Args:
@@ -145,13 +143,15 @@ def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int) -> FloatA
         damaged: shape (k,).
         longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on either side best,
             others by a straight line.
+        time: of each sample, in any unit, shape (k,); None for a constant rate.
     """
     if not np.any(damaged) or np.all(damaged):
         return values
     out = values.copy()
     right = np.flatnonzero(~damaged)
     wrong = np.flatnonzero(damaged)
-    out[wrong] = np.interp(wrong, right, values[right])
+    at = np.arange(len(values), dtype=np.float64) if time is None else time
+    out[wrong] = np.interp(at[wrong], at[right], values[right])
     for block in np.split(wrong, np.flatnonzero(np.diff(wrong) > 1) + 1):
         if len(block) > longest:
             continue
@@ -161,9 +161,9 @@ def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int) -> FloatA
         is_between = near[0] < block[0] and near[-1] > block[-1]
         # Beyond the first and the last reading a cubic goes astray.
         degree = 3 if is_between and len(near) > BESIDE else 1
-        middle = float(np.mean(near))
-        fitted = np.polyfit(near - middle, values[near], degree)
-        out[block] = np.polyval(fitted, block - middle)
+        middle = float(np.mean(at[near]))
+        fitted = np.polyfit(at[near] - middle, values[near], degree)
+        out[block] = np.polyval(fitted, at[block] - middle)
     return out
 
 

@@ -214,7 +214,8 @@ def simulated_outcome(
                     position, current = damaged_raw(one, cell, fault, axis)
                 # An undamaged log has nothing to show: only the damaged run takes the slow ways.
                 take = WAYS[way] if number == DAMAGED_RUN else as_arrays
-                runs.append(replace(take(one, cell, position, current, Path(name) / f"{one.name}.mcap"), started_s=None))
+                run = take(one, cell, position, current, Path(name) / f"{one.name}.mcap")
+                runs.append(replace(run, started_s=None))
         return identify(model_of(cell), runs, cell.conditioning, axes=cell.axis_names)
 
     return outcome(fit, cell.axis_names[axis], cell, true_gains, None)

@@ -28,6 +28,7 @@ from daq.log.importing import import_recording, quantise
 from daq.log.reader import read_log
 from daq.report.document import json_tree
 from daq.report.log import info_report
+from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -344,10 +345,9 @@ def test_currents_without_their_sign_are_noticed(
     assert "heavier payload" not in said
 
 
-@pytest.mark.parametrize("back", [False, True])
-def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str], back: bool) -> None:
+def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     """A step of 0.5 rad in one sample: the speeds over many samples do not show it."""
-    bench.joint_deg[120 : 121 if back else None, 2] += np.degrees(0.5)
+    bench.joint_deg[120:, 2] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _refused(
         bench, capsys, 4, "run.csv:122, column q3, axis J3", "in one sample", "the limit in the cell configuration"
@@ -357,9 +357,61 @@ def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[
 def test_a_step_of_an_axis_that_rests_is_refused_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing else of that axis changes, and the step itself is no noise to compare it with."""
     bench.joint_deg[:, 2] = 60.0
-    bench.joint_deg[120, 2] += np.degrees(0.5)
+    bench.joint_deg[120:, 2] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _refused(bench, capsys, 4, "column q3, axis J3", "in one sample", "the limit in the cell configuration")
+
+
+@pytest.mark.parametrize("resting", [False, True])
+def test_a_glitch_is_said_and_left_to_the_fit(bench: Bench, capsys: pytest.CaptureFixture[str], resting: bool) -> None:
+    if resting:
+        bench.joint_deg[:, 2] = 60.0
+    bench.joint_deg[120, 2] += np.degrees(0.5)
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "run.csv:122, column q3, axis J3: a position that leaves its course by up to 28.6" in said
+    run, cell = load_run(bench.out)
+    assert np.degrees(run.position_rad[120, 2]) == pytest.approx(bench.joint_deg[120, 2], abs=1e-4)
+    (fault,) = find_faults(run.position_rad, run.current_a, run.rate_hz, cell.ratio)
+    assert (fault.kind, fault.axis, fault.stretches.tolist()) == (FaultKind.GLITCH, 2, [[120, 121]])
+
+
+def test_a_glitch_among_resampled_rows_does_not_reach_the_log(bench: Bench) -> None:
+    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    assert bench.run() == 0
+    sound, _ = load_run(bench.out)
+    bench.out.unlink()
+    bench.joint_deg[150, 3] += np.degrees(0.5)
+    bench.current_a[200, 1] = 1e9
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    assert bench.run() == 0
+    mended, _ = load_run(bench.out)
+    assert np.abs(mended.position_rad - sound.position_rad).max() < 1e-4
+    assert np.abs(mended.current_a - sound.current_a).max() < 0.1
+
+
+def test_an_absurd_number_does_not_make_the_other_currents_coarse(bench: Bench) -> None:
+    assert bench.run() == 0
+    sound, _ = load_run(bench.out)
+    bench.out.unlink()
+    bench.current_a[200, 1] = 1e9
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
+    mended, _ = load_run(bench.out)
+    assert np.delete(mended.current_a - sound.current_a, 200, axis=0) == pytest.approx(0.0, abs=1e-8)
+    assert mended.current_a[200] == pytest.approx(sound.current_a[200], abs=0.05)
+
+
+def test_an_axis_at_rest_may_have_no_current(bench: Bench) -> None:
+    """Its brake holds it, and its motor has no power."""
+    bench.joint_deg[:, 2] = 60.0
+    bench.current_a[:, 2] = 0.0
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
 
 
 def test_a_step_is_found_in_resampled_samples_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
@@ -387,7 +439,7 @@ def test_a_counter_of_fewer_than_32_bits_that_wraps(
     counts[:, 0] = wrapped
     bench.write_csv(np.hstack((counts, bench.current_a)))
     bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
-    _refused(bench, capsys, 4, "column q1", f"within {bits} bits: a counter that wraps", "unwrap the column")
+    _refused(bench, capsys, 4, "column q1", f"a counter of {bits} bits that wraps", "unwrap the column")
 
 
 @pytest.mark.parametrize("rows", [1, 2])

@@ -1,4 +1,4 @@
-"""An encoder glitch in a log of our own is refused as in an import, wherever the log is read or called valid."""
+"""A glitch in a log of our own is filled in, a step that stays is refused as in an import, wherever it is judged."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
+from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import save_calibration
 from daq.errors import CurrentImplausible, DataError, ExitCode, PositionImplausible
@@ -26,7 +27,10 @@ from daq.log.salvage import salvage
 from daq.report.log import info_report
 from drivers.messages import Sample
 from ident.arrays import FloatArray
+from ident.data.channel_faults import FaultKind, Quantity
 from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.run import Run
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, write
@@ -64,16 +68,25 @@ def _glitch(rows: slice, axis: int = 1) -> Callable[[FloatArray], None]:
     return change
 
 
-GLITCHES: dict[str, tuple[int | None, Callable[[FloatArray], None], str]] = {
-    "one sample": (None, _glitch(slice(1500, 1501)), "at 1.5 s"),
-    "the first sample": (None, _glitch(slice(0, 1)), "at 0.001 s"),
-    "the last sample": (None, _glitch(slice(-1, None)), "at 4.999 s"),
-    "a run of wrong samples": (None, _glitch(slice(1500, 1507)), "at 1.5"),
-    "a step that stays": (None, _glitch(slice(1500, None)), "at 1.5 s"),
-    "one sample of an axis that rests": (1, _glitch(slice(1500, 1501)), "at 1.5"),
-    "a step of an axis that rests": (1, _glitch(slice(1500, None)), "at 1.5 s"),
-    "between two blocks": (None, _glitch(slice(4096, 4097)), "at 4.09"),
+Change = Callable[[FloatArray], None]
+
+GLITCHES: dict[str, tuple[int | None, Change]] = {
+    "one sample": (None, _glitch(slice(1500, 1501))),
+    "the first sample": (None, _glitch(slice(0, 1))),
+    "the last sample": (None, _glitch(slice(-1, None))),
+    "a run of wrong samples": (None, _glitch(slice(1500, 1507))),
+    "one sample of an axis that rests": (1, _glitch(slice(1500, 1501))),
+    "between two blocks": (None, _glitch(slice(4096, 4097))),
 }
+STEPS: dict[str, tuple[int | None, Change, str]] = {
+    "a step that stays": (None, _glitch(slice(1500, None)), "at 1.5 s"),
+    "a step of an axis that rests": (1, _glitch(slice(1500, None)), "at 1.5 s"),
+    "a step between two blocks": (None, _glitch(slice(4096, None)), "at 4.096 s"),
+}
+
+
+def _differentiated(run: Run, cell: Cell) -> Dataset:
+    return differentiate(run, model_of(cell).drive_train, Conditioning(standstill_rad_s=(0.03,) * AXES))
 
 
 def _log(path: Path, rows: list[Sample]) -> Path:
@@ -81,10 +94,41 @@ def _log(path: Path, rows: list[Sample]) -> Path:
 
 
 @pytest.mark.parametrize("kind", GLITCHES)
-def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
+def test_a_glitch_is_filled_in_and_the_log_called_valid_by_all(kind: str, tmp_path: Path) -> None:
+    resting, change = GLITCHES[kind]
+    joint_rad = _joints(resting=resting)
+    sound = joint_rad.copy()
+    sound_data = _differentiated(*load_run(_log(tmp_path / "sound.mcap", _samples(sound))))
+    change(joint_rad)
+    rows = _samples(joint_rad)
+    log = _log(tmp_path / "a.mcap", rows)
+    run, cell = load_run(log)
+    data = _differentiated(run, cell)
+    (fault,) = data.faults
+    where = np.flatnonzero(joint_rad[:, 1] != sound[:, 1])
+    assert (fault.kind, fault.quantity, fault.axis) == (FaultKind.GLITCH, Quantity.POSITION, 1)
+    assert fault.stretches.tolist() == [[where[0], where[-1] + 1]]
+    assert fault.size == pytest.approx(GLITCH_RAD * CELL.ratio[1, 1], rel=0.01)
+    assert sound_data.faults == ()
+    assert np.abs(data.position_rad - sound_data.position_rad).max() < 1e-4
+    described = info_report(log)
+    table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
+    recorded = RecordedMotion(AXES)
+    for row in rows:
+        recorded.take(row)
+    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    assert recorded.reason(CELL, readback, RATE_HZ) == ""
+    saved = salvage(log.rename(tmp_path / "b.mcap.part"), tmp_path / "saved.mcap")
+    assert described.valid
+    assert table.valid
+    assert saved.statistics.valid
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_a_step_of_the_encoder_is_refused_and_called_invalid_by_all(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    resting, change, when = GLITCHES[kind]
+    resting, change, when = STEPS[kind]
     joint_rad = _joints(resting=resting)
     sound = _log(tmp_path / "sound.mcap", _samples(joint_rad))
     load_run(sound)
@@ -116,11 +160,11 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
 
 
 @pytest.mark.parametrize("verb", ["fit", "residual", "validate", "weigh", "contact"])
-def test_every_verb_refuses_a_glitch(
+def test_every_verb_refuses_a_step(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], full_calibration: Path
 ) -> None:
     joint_rad = _joints()
-    joint_rad[1500, 1] += GLITCH_RAD
+    joint_rad[1500:, 1] += GLITCH_RAD
     log = str(_log(tmp_path / "a.mcap", _samples(joint_rad)))
     arguments = [log, log] if verb in {"fit", "residual"} else [str(full_calibration), log]
     assert main([verb, *arguments]) == ExitCode.DATA_UNFIT
@@ -129,14 +173,30 @@ def test_every_verb_refuses_a_glitch(
     assert "axis J2" in said
 
 
-def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path: Path) -> None:
+def _with_current(rows: list[Sample], first: int, values: list[int]) -> list[Sample]:
+    """Samples with other currents of the first axis from one of them on."""
+    changed = list(rows)
+    for number, value in enumerate(values, start=first):
+        own = rows[number].current_raw
+        changed[number] = replace(rows[number], current_raw=(value, *own[1:]))
+    return changed
+
+
+def test_one_current_that_no_amplifier_sets_is_filled_in(tmp_path: Path) -> None:
     rows = _samples(_joints())
-    (first, *others) = rows[1000].current_raw
-    rows[1000] = Sample(
-        rows[1000].cycle, rows[1000].time_ns, rows[1000].position_counts, (2**30, *others), (0x1237,) * AXES, 0
-    )
-    assert abs(first) <= 200
-    log = _log(tmp_path / "a.mcap", rows)
+    log = _log(tmp_path / "a.mcap", _with_current(rows, 1000, [2**30]))
+    run, cell = load_run(log)
+    data = _differentiated(run, cell)
+    (fault,) = data.faults
+    assert (fault.kind, fault.quantity, fault.axis, fault.first) == (FaultKind.GLITCH, Quantity.CURRENT, 0, 1000)
+    sound_a = 0.002 * rows[1000].current_raw[0]
+    assert data.current_a[999, 0] == pytest.approx(sound_a, abs=0.01)
+    assert info_report(log).valid
+
+
+def test_currents_that_no_amplifier_sets_are_refused_and_called_invalid(tmp_path: Path) -> None:
+    rows = _samples(_joints())
+    log = _log(tmp_path / "a.mcap", _with_current(rows, 1000, [2**28, 2**30, 2**29, -(2**28), 2**27]))
     with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1 s; expected a current"):
         load_run(log)
     described = info_report(log)
