@@ -9,7 +9,7 @@ sign `ident.data.unsigned_current`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -120,7 +120,7 @@ def find_faults(
     for axis, readings in enumerate(_readings(read, rate_hz)):
         found += _position_faults(readings, Place(Quantity.POSITION, axis, len(position), unit))
     if ratio is not None:
-        found += _joint_faults(position, ratio, rate_hz, {one.axis for one in found})
+        found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
         found += _current_faults(readings, read[:, axis], Place(Quantity.CURRENT, axis, len(position)))
     if usable is None:
@@ -144,13 +144,32 @@ def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
     return motor_rad
 
 
-def _joint_faults(position: FloatArray, ratio: FloatArray, rate_hz: float, motors: Set[int]) -> Iterator[ChannelFault]:
-    """Judge joints that several motors turn, where nothing is wrong with these: their own encoders may be read."""
-    turned_by = np.abs(np.linalg.inv(ratio)) > 0.0
+def _with_joints(
+    motors: Sequence[ChannelFault], position: FloatArray, ratio: FloatArray, rate_hz: float
+) -> list[ChannelFault]:
+    """Add the faults of joints that several motors turn, whose own encoders may have been read.
+
+    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are in each of them.
+
+    Args:
+        motors: faults of the positions of the motors.
+        position: of the joints, shape (k, n).
+        ratio: R of the drive train, shape (n, n).
+        rate_hz: sampling rate.
+    """
+    found = list(motors)
+    turned_by = np.linalg.inv(ratio) != 0.0
     coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
     for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
-        if not motors & set(np.flatnonzero(turned_by[joint]).tolist()):
-            yield from _position_faults(readings, Place(Quantity.POSITION, joint, len(position), JOINT_UNIT))
+        own = [one for one in found if turned_by[joint, one.axis]]
+        if any(one.kind is not FaultKind.DISPLACED for one in own):
+            continue
+        faults = list(_position_faults(readings, Place(Quantity.POSITION, joint, len(position), JOINT_UNIT)))
+        if any(one.is_left_out for one in faults):
+            found = [one for one in found if one not in own]
+        if any(one.is_left_out for one in faults) or not own:
+            found += faults
+    return found
 
 
 def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> ChannelFault | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.glitches import SUSPECT_PERCENTILE, Readings
+from ident.data.glitches import Readings
 from ident.data.held import ROUNDING
 
 LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
@@ -17,6 +17,7 @@ LEAST_CURRENT_S = 0.1  #: Likewise of a current
 ABRUPT = 3.0
 """Way within BESIDE_S beside a stretch, in multiples of the largest usual change of it from one such time to the next:
 what a motor has on its way to a standstill is half of that."""
+USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
 BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
@@ -40,10 +41,14 @@ def frozen_position(readings: Readings) -> IntArray:
     course = np.interp(np.arange(samples), readings.sample, readings.values)
     way = np.abs(course[beside:] - course[:-beside])
     changes = np.abs(course[2 * beside :] - 2.0 * course[beside:-beside] + course[: -2 * beside])
-    moving = way[beside:] > tiny
-    if not np.any(moving):
+    counts = way[beside:] > tiny
+    for first, last in stretches:
+        begin = int(readings.sample[first])
+        end = int(readings.sample[last])
+        counts[max(begin - 3 * beside, 0) : end + beside] = False
+    if not np.any(counts):
         return _no_stretch()
-    usual = float(np.percentile(changes[moving], SUSPECT_PERCENTILE))
+    usual = float(np.percentile(changes[counts], USUAL_PERCENTILE))
     least = ABRUPT * usual + ABRUPT_COUNTS * readings.count
     found: list[tuple[int, int]] = []
     for first, last in stretches:

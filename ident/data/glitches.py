@@ -17,16 +17,22 @@ from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.held import ROUNDING
 
 SUSPECT = 10.0
-"""A step is looked at whose change is so many times the SUSPECT_PERCENTILE of the changes of a channel."""
-SUSPECT_PERCENTILE = 98.0
-JUMP = 20.0
-"""A jump differs from the steps around it by so many times their spread. Noise that is normal reaches 8 times."""
+"""A step is looked at whose change is so many times a percentile of the changes of a channel."""
+POSITION_PERCENTILE, CURRENT_PERCENTILE = 90.0, 98.0
+"""That percentile. A position is smooth at any time. A controller may ask for a current that is one for a sample: where
+a joint breaks loose, those of a real robot have up to 12 times the percentile, and ring on."""
+JUMP = 10.0
+"""A jump differs from the steps around it by so many times their spread. Noise that is normal reaches 5 times."""
+SPREAD_PERCENTILE = 80.0
+"""Percentile of the distances of the steps around from their median: a current that goes up and down with friction has
+many small ones beside its large ones; two other glitches may be near."""
 JUMP_COUNTS = 20.0  #: And by so many counts: an encoder at rest may flicker
 LEAST_CHANGES = 20  #: Of a channel that shows its counts: those of an axis at rest may be glitches alone
 NEAR, FAR = 5, 14  #: Steps around a jump that are compared with it, from and to, on either side
 SHORT = 3  #: Readings that a glitch of any shape may have
 LONGEST_S = 0.05  #: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
 RETURN = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
+RETURNED = 2  #: Readings after it that are on the course; what rings on is a blow to the robot
 SAME_SIZE = 0.05  #: Largest relative difference of the steps of a counter that wraps
 EMPTY_FROM, EMPTY_TO = 0.25, 0.75  #: Part of a range that is empty where negative numbers lost their sign
 LEAST_SPLIT = 0.01  #: Least share of the values at either end of it
@@ -76,7 +82,7 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
         is_position: a position is continuous. A current may go up and down within some samples, so a longer glitch
             of a current repeats one number.
     """
-    step, size = _jumps(readings)
+    step, size = _jumps(readings, POSITION_PERCENTILE if is_position else CURRENT_PERCENTILE)
     longest = max(SHORT, round(LONGEST_S * readings.rate_hz))
     glitches: list[Glitch] = []
     left: list[int] = []
@@ -116,14 +122,14 @@ def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
     return np.abs(steps[step] - np.median(steps[beside], axis=1))
 
 
-def _jumps(readings: Readings) -> tuple[IntArray, FloatArray]:
+def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
     """Steps unlike those around them, by the number of the reading before, and their sizes less the motion."""
     nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
     steps = np.diff(readings.values)
     if len(steps) < 2 * FAR:
         return nothing
     changes = np.abs(np.diff(steps))
-    least = SUSPECT * float(np.percentile(changes, SUSPECT_PERCENTILE))
+    least = SUSPECT * float(np.percentile(changes, percentile))
     is_large = changes > max(least, ROUNDING * float(np.ptp(readings.values)))
     is_suspect = np.zeros(len(steps), dtype=np.bool_)
     is_suspect[1:] |= is_large
@@ -138,7 +144,7 @@ def _jumps(readings: Readings) -> tuple[IntArray, FloatArray]:
     is_outside = (places < 0) | (places >= len(steps))
     around = np.where(is_outside, np.nan, steps[np.clip(places, 0, len(steps) - 1)])
     motion = np.nanmedian(around, axis=1)
-    spread = np.nanmedian(np.abs(around - motion[:, None]), axis=1)
+    spread = np.nanpercentile(np.abs(around - motion[:, None]), SPREAD_PERCENTILE, axis=1)
     size = steps[suspects] - motion
     is_jump = np.abs(size) > JUMP * spread + JUMP_COUNTS * readings.count
     return suspects[is_jump], size[is_jump]
@@ -160,8 +166,9 @@ def _glitch_from(
         samples = int(readings.sample[end] - readings.sample[begin])
         if samples > longest:
             break
-        off = float(values[end + 1] - values[begin]) - motion * (end + 1 - begin)
-        if abs(off) > RETURN * abs(leaves):
+        after = np.arange(end + 1, min(end + 1 + RETURNED, len(values)))
+        off = values[after] - values[begin] - motion * (after - begin)
+        if np.max(np.abs(off)) > RETURN * abs(leaves):
             continue
         inside = values[begin + 1 : end + 1]
         is_repeated = np.ptp(inside) == 0.0
