@@ -115,9 +115,7 @@ def _constant(readings: Readings, tiny: float, least_s: float) -> list[tuple[int
     changed = np.abs(np.diff(readings.values)) > tiny
     first = np.concatenate(([0], np.flatnonzero(changed) + 1))
     last = np.append(first[1:], len(readings.values)) - 1
-    # A reading that was held lasts until the next one.
-    end_sample = np.append(readings.sample[1:], readings.sample[-1] + 1)[last]
-    long = end_sample - readings.sample[first] > least_s * readings.rate_hz
+    long = readings.sample[last] + 1 - readings.sample[first] > least_s * readings.rate_hz
     return list(zip(first[long].tolist(), last[long].tolist(), strict=True))
 
 

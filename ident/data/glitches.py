@@ -119,7 +119,8 @@ def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
     """Size of each step less the motion, by the two steps on either side of it, shape (s,)."""
     steps = np.diff(readings.values)
     beside = np.clip(step[:, None] + np.array([-2, -1, 1, 2]), 0, len(steps) - 1)
-    return np.abs(steps[step] - np.median(steps[beside], axis=1))
+    size: FloatArray = np.abs(steps[step] - np.median(steps[beside], axis=1))
+    return size
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
