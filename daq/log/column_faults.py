@@ -17,7 +17,7 @@ from daq.errors import TableUnfit
 from daq.log.conversion import unwrapped
 from daq.log.table import Table
 from ident.arrays import FloatArray, IntArray
-from ident.data.channel_faults import ChannelFault, Quantity, find_faults, mended, refused_fault
+from ident.data.channel_faults import ChannelFault, ChannelKind, find_faults, mended, refused_fault
 from ident.data.fault_text import expected, found, remedy, what_is_done
 
 
@@ -34,7 +34,7 @@ class UsedRows:
 
     def place_of(self, fault: ChannelFault) -> str:
         """Name the number at which a fault begins, and its axis."""
-        section = self.wanted.position if fault.quantity is Quantity.POSITION else self.wanted.current
+        section = self.wanted.position if fault.quantity is ChannelKind.POSITION else self.wanted.current
         columns: Sequence[Column] = section.columns
         place = self.files[section.file].place(int(self.row[fault.first]), columns[fault.axis])
         return f"{place}, axis {self.cell.axes[fault.axis].name}"
@@ -73,7 +73,7 @@ def sound_columns(position: FloatArray, current: FloatArray, used: UsedRows) -> 
         # The counter of 32 bits goes on at its other end.
         mended_position = np.rint(mended_position).astype(np.int64).astype(np.int32).astype(np.float64)
     mended_current = current.copy()
-    mended_current[used.row] = mended(own_current, faults, used.rate_hz, quantity=Quantity.CURRENT, time=used.time_s)
+    mended_current[used.row] = mended(own_current, faults, used.rate_hz, quantity=ChannelKind.CURRENT, time=used.time_s)
     return SoundColumns(mended_position, mended_current, faults)
 
 

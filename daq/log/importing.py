@@ -142,7 +142,7 @@ class Converted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
+class JudgedRecording:
     """A recording that a robot can have made."""
 
     used: UsedRows
@@ -151,7 +151,7 @@ class Recorded:
     faults: tuple[ChannelFault, ...]  #: readings that are none
 
 
-def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> Recorded:
+def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> JudgedRecording:
     """Judge and convert what the files hold.
 
     Raises:
@@ -192,7 +192,7 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
         # A fit mends them alike; but an absurd number would make the counts of its column too coarse.
         is_absurd = impossible_current(current) is not None
         kept = _converted(wanted, cell, position[row], sound.current if is_absurd else current, clock)
-    return Recorded(used, clock, kept, sound.faults)
+    return JudgedRecording(used, clock, kept, sound.faults)
 
 
 def _converted(

@@ -15,7 +15,7 @@ import numpy as np
 from daq.config.cell import Cell, CellAxis
 from daq.errors import CurrentImplausible, DataError, PositionImplausible
 from ident.arrays import BoolArray, FloatArray
-from ident.data.channel_faults import ChannelFault, Quantity, mended, refused_fault
+from ident.data.channel_faults import ChannelFault, ChannelKind, mended, refused_fault
 from ident.data.fault_text import expected, found, remedy
 
 LARGEST_OUTLIER = 1000.0
@@ -209,7 +209,7 @@ def motion_fault(
     displaced = refused_fault(faults, displaced=True)
     if displaced is not None:
         return fault_error(displaced, name, cell)
-    outlier = impossible_current(mended(current, faults, rate_hz, quantity=Quantity.CURRENT))
+    outlier = impossible_current(mended(current, faults, rate_hz, quantity=ChannelKind.CURRENT))
     if outlier is not None:
         timed = replace(outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s")
         check = "record again, and check the object that the drive sends as its current"
@@ -225,7 +225,7 @@ def fault_error(fault: ChannelFault, name: str, cell: Cell) -> DataError:
         name: of the recording in the message.
         cell: with the names of the axes.
     """
-    kind = PositionImplausible if fault.quantity is Quantity.POSITION else CurrentImplausible
+    kind = PositionImplausible if fault.quantity is ChannelKind.POSITION else CurrentImplausible
     subject = f"{name}, axis {cell.axes[fault.axis].name}"
     return kind(subject, found=found(fault), expected=expected(fault), remedy=remedy(fault))
 

@@ -29,7 +29,7 @@ MOTOR_UNIT, JOINT_UNIT = "rad of the motor", "rad or m of the joint"
 ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
 
 
-class Quantity(Enum):
+class ChannelKind(Enum):
     """What a channel holds."""
 
     POSITION = "position"
@@ -52,7 +52,7 @@ class ChannelFault:
     """Something wrong with one channel of a recording."""
 
     kind: FaultKind
-    quantity: Quantity
+    quantity: ChannelKind
     axis: int  #: index
     stretches: IntArray  #: first sample and end of each, shape (s, 2)
     size: float  #: largest distance from the course, or the range of a counter, in the unit of the channel
@@ -118,11 +118,11 @@ def find_faults(
     found: list[ChannelFault] = []
     read = position if ratio is None else motor_positions(position, ratio)
     for axis, readings in enumerate(_readings(read, rate_hz)):
-        found += _position_faults(readings, Place(Quantity.POSITION, axis, len(position), unit))
+        found += _position_faults(readings, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit))
     if ratio is not None:
         found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
-        found += _current_faults(readings, read[:, axis], Place(Quantity.CURRENT, axis, len(position)))
+        found += _current_faults(readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position)))
     if usable is None:
         return tuple(found)
     return tuple(one for one in found if _is_in_use(one, usable))
@@ -164,7 +164,7 @@ def _with_joints(
         own = [one for one in found if turned_by[joint, one.axis]]
         if any(one.kind is not FaultKind.DISPLACED for one in own):
             continue
-        faults = list(_position_faults(readings, Place(Quantity.POSITION, joint, len(position), JOINT_UNIT)))
+        faults = list(_position_faults(readings, ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)))
         if any(one.is_left_out for one in faults):
             found = [one for one in found if one not in own]
         if any(one.is_left_out for one in faults) or not own:
@@ -187,7 +187,7 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
 
 def replaced_samples(
-    faults: Sequence[ChannelFault], quantity: Quantity, shape: tuple[int, ...], ratio: FloatArray | None = None
+    faults: Sequence[ChannelFault], quantity: ChannelKind, shape: tuple[int, ...], ratio: FloatArray | None = None
 ) -> BoolArray:
     """Samples of each column that are to be replaced by those around them, shape (k, n).
 
@@ -203,7 +203,7 @@ def replaced_samples(
     to_joint = None if ratio is None else np.linalg.inv(ratio)
     marked = np.zeros(shape, dtype=np.bool_)
     for one in faults:
-        is_replaced = one.is_filled or (one.quantity is Quantity.POSITION and one.is_left_out)
+        is_replaced = one.is_filled or (one.quantity is ChannelKind.POSITION and one.is_left_out)
         if one.quantity is not quantity or not is_replaced:
             continue
         columns = np.array([one.axis])
@@ -219,7 +219,7 @@ def mended(
     faults: Sequence[ChannelFault],
     rate_hz: float,
     ratio: FloatArray | None = None,
-    quantity: Quantity = Quantity.POSITION,
+    quantity: ChannelKind = ChannelKind.POSITION,
     time: FloatArray | None = None,
 ) -> FloatArray:
     """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
@@ -235,7 +235,7 @@ def mended(
     replaced = replaced_samples(faults, quantity, values.shape, ratio)
     if not np.any(replaced):
         return values
-    longest = longest_smooth(rate_hz) if quantity is Quantity.POSITION else 0
+    longest = longest_smooth(rate_hz) if quantity is ChannelKind.POSITION else 0
     columns = [fill_damaged(own, wrong, longest, time) for own, wrong in zip(values.T, replaced.T, strict=True)]
     return np.stack(columns, axis=1)
 
@@ -255,7 +255,7 @@ def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], mar
         if not one.is_left_out:
             continue
         for first, end in one.stretches.tolist():
-            if one.quantity is Quantity.POSITION:
+            if one.quantity is ChannelKind.POSITION:
                 out[max(first - margin, 0) : end + margin] = True
             else:
                 out[first:end, one.axis] = True
@@ -263,10 +263,10 @@ def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], mar
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ChannelPlace:
     """A channel of a recording."""
 
-    quantity: Quantity
+    quantity: ChannelKind
     axis: int  #: index
     samples: int  #: of the recording
     unit: str = ""  #: of the channel, for messages
@@ -299,7 +299,7 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
         yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
 
 
-def _position_faults(readings: Readings, place: Place) -> Iterator[ChannelFault]:
+def _position_faults(readings: Readings, place: ChannelPlace) -> Iterator[ChannelFault]:
     jumps = find_jumps(readings, is_position=True)
     whole = wrap_size(readings, jumps)
     if whole is not None:
@@ -321,7 +321,7 @@ def _position_faults(readings: Readings, place: Place) -> Iterator[ChannelFault]
         yield place.fault(FaultKind.DISPLACED, readings, _steps(readings, jumps.step[lost]), size)
 
 
-def _current_faults(readings: Readings, motor_rad: FloatArray, place: Place) -> Iterator[ChannelFault]:
+def _current_faults(readings: Readings, motor_rad: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
     upper = is_split(readings.values)
     if upper is not None:
         step = np.flatnonzero(np.diff(upper))

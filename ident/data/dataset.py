@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
-from ident.data.channel_faults import ChannelFault, Quantity, find_faults, left_out_samples, replaced_samples
+from ident.data.channel_faults import ChannelFault, ChannelKind, find_faults, left_out_samples, replaced_samples
 from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.held import HeldChannels, fill_held
@@ -97,8 +97,8 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         position,
         current,
         rate,
-        replaced_samples(faults, Quantity.POSITION, shape, drive_train.ratio),
-        replaced_samples(faults, Quantity.CURRENT, shape),
+        replaced_samples(faults, ChannelKind.POSITION, shape, drive_train.ratio),
+        replaced_samples(faults, ChannelKind.CURRENT, shape),
     )
     raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import log2
 
-from ident.data.channel_faults import ChannelFault, FaultKind, Quantity
+from ident.data.channel_faults import ChannelFault, ChannelKind, FaultKind
 from ident.errors import Diagnosis, ReadingsDamaged
 
 DAMAGED, FROZEN = "readings-damaged", "readings-frozen"  #: Names of diagnoses
@@ -79,14 +79,14 @@ def found(fault: ChannelFault) -> str:
 
 def expected(fault: ChannelFault) -> str:
     """Say what is expected in place of a fault."""
-    if fault.quantity is Quantity.CURRENT:
+    if fault.quantity is ChannelKind.CURRENT:
         return "a current that follows the torque at every moment, with its sign"
     return "a position that follows the motion at every moment"
 
 
 def remedy(fault: ChannelFault) -> str:
     """Say what to do about a fault."""
-    is_position = fault.quantity is Quantity.POSITION
+    is_position = fault.quantity is ChannelKind.POSITION
     match fault.kind:
         case FaultKind.WRAPPING if is_position:
             return (

@@ -27,7 +27,7 @@ from daq.log.salvage import salvage
 from daq.report.log import info_report
 from drivers.messages import Sample
 from ident.arrays import FloatArray
-from ident.data.channel_faults import FaultKind, Quantity
+from ident.data.channel_faults import ChannelKind, FaultKind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
@@ -106,7 +106,7 @@ def test_a_glitch_is_filled_in_and_the_log_called_valid_by_all(kind: str, tmp_pa
     data = _differentiated(run, cell)
     (fault,) = data.faults
     where = np.flatnonzero(joint_rad[:, 1] != sound[:, 1])
-    assert (fault.kind, fault.quantity, fault.axis) == (FaultKind.GLITCH, Quantity.POSITION, 1)
+    assert (fault.kind, fault.quantity, fault.axis) == (FaultKind.GLITCH, ChannelKind.POSITION, 1)
     assert fault.stretches.tolist() == [[where[0], where[-1] + 1]]
     assert fault.size == pytest.approx(GLITCH_RAD * CELL.ratio[1, 1], rel=0.01)
     assert sound_data.faults == ()
@@ -188,7 +188,7 @@ def test_one_current_that_no_amplifier_sets_is_filled_in(tmp_path: Path) -> None
     run, cell = load_run(log)
     data = _differentiated(run, cell)
     (fault,) = data.faults
-    assert (fault.kind, fault.quantity, fault.axis, fault.first) == (FaultKind.GLITCH, Quantity.CURRENT, 0, 1000)
+    assert (fault.kind, fault.quantity, fault.axis, fault.first) == (FaultKind.GLITCH, ChannelKind.CURRENT, 0, 1000)
     sound_a = 0.002 * rows[1000].current_raw[0]
     assert data.current_a[999, 0] == pytest.approx(sound_a, abs=0.01)
     assert info_report(log).valid
