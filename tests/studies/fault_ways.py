@@ -24,6 +24,7 @@ from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import CellEvent, EventKind, Sample
 from ident.arrays import FloatArray
+from ident.data.channel_faults import ChannelKind
 from ident.data.run import Run
 from ident.errors import IdentificationError
 from ident.estimators.diagnosis import diagnose
@@ -31,7 +32,7 @@ from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify
 from tests.studies.direct_cell import RawRun, run_of
 from tests.studies.effect_runs import IMPORT
-from tests.studies.planted_faults import PlantedFault, Quantity, SoundChannel
+from tests.studies.planted_faults import PlantedFault, SoundChannel
 
 DAMAGED_RUN = 1  #: Of the simulated cell: disc-1
 INT16_LARGEST = 2000.0  #: Counts of the largest current of the real arm, as a drive of 16 bits might report it
@@ -115,7 +116,7 @@ def damaged_raw(raw: RawRun, cell: Cell, fault: PlantedFault, axis: int) -> tupl
     current = raw.current_raw.astype(np.float64)
     rate_hz = 1e9 / PERIOD_NS
     turn = float(cell.axes[axis].counts_per_revolution or 0)
-    if fault.quantity is Quantity.POSITION:
+    if fault.quantity is ChannelKind.POSITION:
         position[:, axis] = fault.plant(SoundChannel(position[:, axis], 1.0, turn, rate_hz))
     else:
         largest = float(np.max(np.abs(current[:, axis])))
@@ -237,7 +238,7 @@ def tx40_outcome(folder: Path, fault: PlantedFault | None, axis: int, way: str) 
     cell = load_cell(shipped / "cells" / "tx40.yaml")
     position = np.loadtxt(folder / "pos_read_data.csv", delimiter=",", skiprows=1)
     current = np.loadtxt(folder / "curr_data.csv", delimiter=",", skiprows=1)
-    if fault is not None and fault.quantity is Quantity.POSITION:
+    if fault is not None and fault.quantity is ChannelKind.POSITION:
         channel = SoundChannel(position[:, axis], _count(position[:, axis]), 2.0 * np.pi, 5000.0)
         position[:, axis] = fault.plant(channel)
     elif fault is not None:

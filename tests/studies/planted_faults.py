@@ -8,21 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from ident.arrays import FloatArray, IntArray
+from ident.data.channel_faults import ChannelKind
 
 SEED = 5  #: Of the places of a fault
 INT16 = 2.0**16
-
-
-class Quantity(Enum):
-    """Which channel of an axis a fault is planted in."""
-
-    POSITION = "position"
-    CURRENT = "current"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,13 +33,18 @@ class PlantedFault:
     """A fault and the channel that it is planted in."""
 
     name: str
-    quantity: Quantity
+    quantity: ChannelKind
     plant: Callable[[SoundChannel], FloatArray]
 
     @property
     def label(self) -> str:
         """Name with its channel."""
         return f"{self.quantity.value}: {self.name}"
+
+    @property
+    def is_not_a_number(self) -> bool:
+        """Whether it has no integer: a log holds counts."""
+        return self.plant is _not_a_number
 
 
 def _places(channel: SoundChannel, count: int) -> IntArray:
@@ -167,37 +165,37 @@ def _turns(share: float) -> Callable[[SoundChannel], float]:
 ONE_SAMPLE = 0.0
 
 FAULTS = (
-    PlantedFault("frozen for 0.2 s", Quantity.POSITION, _frozen(0.2)),
-    PlantedFault("frozen for 1 s", Quantity.POSITION, _frozen(1.0)),
-    PlantedFault("frozen to the end", Quantity.POSITION, _frozen_to_the_end),
-    PlantedFault("frozen throughout", Quantity.POSITION, _constant),
-    PlantedFault("wraps at 16 bits, signed", Quantity.POSITION, _wrapped(_sixteen_bits, signed=True)),
-    PlantedFault("wraps at 16 bits, unsigned", Quantity.POSITION, _wrapped(_sixteen_bits, signed=False)),
-    PlantedFault("wraps at a turn of the motor", Quantity.POSITION, _wrapped(_turn, signed=False)),
-    PlantedFault("clipped above its 95th percentile", Quantity.POSITION, _clipped(95.0)),
-    PlantedFault("clipped above its 80th percentile", Quantity.POSITION, _clipped(80.0)),
-    PlantedFault("1 spike of 0.02 turns, 1 sample", Quantity.POSITION, _spikes(1, _turns(0.02))),
-    PlantedFault("1 spike of 0.2 turns, 1 sample", Quantity.POSITION, _spikes(1, _turns(0.2))),
-    PlantedFault("1 spike of 5 turns, 1 sample", Quantity.POSITION, _spikes(1, _turns(5.0))),
-    PlantedFault("10 spikes of 0.2 turns, 1 sample", Quantity.POSITION, _spikes(10, _turns(0.2))),
-    PlantedFault("1 sign flip, 1 sample", Quantity.POSITION, _sign_flips(1)),
-    PlantedFault("1 dropout to zero, 1 sample", Quantity.POSITION, _zeros(1, ONE_SAMPLE)),
-    PlantedFault("1 dropout to zero, 10 ms", Quantity.POSITION, _zeros(1, 0.01)),
-    PlantedFault("1 not-a-number", Quantity.POSITION, _not_a_number),
-    PlantedFault("frozen for 0.2 s", Quantity.CURRENT, _frozen(0.2)),
-    PlantedFault("frozen for 1 s", Quantity.CURRENT, _frozen(1.0)),
-    PlantedFault("frozen to the end", Quantity.CURRENT, _frozen_to_the_end),
-    PlantedFault("frozen throughout", Quantity.CURRENT, _constant),
-    PlantedFault("int16 read as unsigned", Quantity.CURRENT, _wrapped(_sixteen_bits, signed=False)),
-    PlantedFault("wraps at half of its range", Quantity.CURRENT, _wrapped(_times_largest(1.0), signed=True)),
-    PlantedFault("size without sign", Quantity.CURRENT, lambda channel: np.abs(channel.values)),
-    PlantedFault("clipped above its 95th percentile", Quantity.CURRENT, _clipped(95.0)),
-    PlantedFault("clipped at its 85th percentile, both ways", Quantity.CURRENT, _clipped_both_ways),
-    PlantedFault("1 spike of its largest, 1 sample", Quantity.CURRENT, _spikes(1, _times_largest(1.0))),
-    PlantedFault("1 spike of 30 times its largest, 1 sample", Quantity.CURRENT, _spikes(1, _times_largest(30.0))),
-    PlantedFault("10 spikes of 30 times its largest, 1 sample", Quantity.CURRENT, _spikes(10, _times_largest(30.0))),
-    PlantedFault("20 sign flips, 1 sample", Quantity.CURRENT, _sign_flips(20)),
-    PlantedFault("20 dropouts to zero, 1 sample", Quantity.CURRENT, _zeros(20, ONE_SAMPLE)),
-    PlantedFault("20 dropouts to zero, 10 ms", Quantity.CURRENT, _zeros(20, 0.01)),
-    PlantedFault("1 not-a-number", Quantity.CURRENT, _not_a_number),
+    PlantedFault("frozen for 0.2 s", ChannelKind.POSITION, _frozen(0.2)),
+    PlantedFault("frozen for 1 s", ChannelKind.POSITION, _frozen(1.0)),
+    PlantedFault("frozen to the end", ChannelKind.POSITION, _frozen_to_the_end),
+    PlantedFault("frozen throughout", ChannelKind.POSITION, _constant),
+    PlantedFault("wraps at 16 bits, signed", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=True)),
+    PlantedFault("wraps at 16 bits, unsigned", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=False)),
+    PlantedFault("wraps at a turn of the motor", ChannelKind.POSITION, _wrapped(_turn, signed=False)),
+    PlantedFault("clipped above its 95th percentile", ChannelKind.POSITION, _clipped(95.0)),
+    PlantedFault("clipped above its 80th percentile", ChannelKind.POSITION, _clipped(80.0)),
+    PlantedFault("1 spike of 0.02 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(0.02))),
+    PlantedFault("1 spike of 0.2 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(0.2))),
+    PlantedFault("1 spike of 5 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(5.0))),
+    PlantedFault("10 spikes of 0.2 turns, 1 sample", ChannelKind.POSITION, _spikes(10, _turns(0.2))),
+    PlantedFault("1 sign flip, 1 sample", ChannelKind.POSITION, _sign_flips(1)),
+    PlantedFault("1 dropout to zero, 1 sample", ChannelKind.POSITION, _zeros(1, ONE_SAMPLE)),
+    PlantedFault("1 dropout to zero, 10 ms", ChannelKind.POSITION, _zeros(1, 0.01)),
+    PlantedFault("1 not-a-number", ChannelKind.POSITION, _not_a_number),
+    PlantedFault("frozen for 0.2 s", ChannelKind.CURRENT, _frozen(0.2)),
+    PlantedFault("frozen for 1 s", ChannelKind.CURRENT, _frozen(1.0)),
+    PlantedFault("frozen to the end", ChannelKind.CURRENT, _frozen_to_the_end),
+    PlantedFault("frozen throughout", ChannelKind.CURRENT, _constant),
+    PlantedFault("int16 read as unsigned", ChannelKind.CURRENT, _wrapped(_sixteen_bits, signed=False)),
+    PlantedFault("wraps at half of its range", ChannelKind.CURRENT, _wrapped(_times_largest(1.0), signed=True)),
+    PlantedFault("size without sign", ChannelKind.CURRENT, lambda channel: np.abs(channel.values)),
+    PlantedFault("clipped above its 95th percentile", ChannelKind.CURRENT, _clipped(95.0)),
+    PlantedFault("clipped at its 85th percentile, both ways", ChannelKind.CURRENT, _clipped_both_ways),
+    PlantedFault("1 spike of its largest, 1 sample", ChannelKind.CURRENT, _spikes(1, _times_largest(1.0))),
+    PlantedFault("1 spike of 30 times its largest, 1 sample", ChannelKind.CURRENT, _spikes(1, _times_largest(30.0))),
+    PlantedFault("10 spikes of 30 times its largest, 1 sample", ChannelKind.CURRENT, _spikes(10, _times_largest(30.0))),
+    PlantedFault("20 sign flips, 1 sample", ChannelKind.CURRENT, _sign_flips(20)),
+    PlantedFault("20 dropouts to zero, 1 sample", ChannelKind.CURRENT, _zeros(20, ONE_SAMPLE)),
+    PlantedFault("20 dropouts to zero, 10 ms", ChannelKind.CURRENT, _zeros(20, 0.01)),
+    PlantedFault("1 not-a-number", ChannelKind.CURRENT, _not_a_number),
 )

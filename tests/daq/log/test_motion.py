@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.cli.app import main
 from daq.config.cell import Cell, model_of
@@ -173,6 +174,48 @@ def test_every_verb_refuses_a_step(
     assert "axis J2" in said
 
 
+def _frozen(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[3500:4400, 1] = joint_rad[3500, 1]
+
+
+def _clipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[:, 1] = np.minimum(joint_rad[:, 1], np.percentile(joint_rad[:, 1], 80.0))
+
+
+def _without_sign(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    current[:, 1] = np.mod(current[:, 1], 2**16)
+
+
+def _slipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[1500:, 1] += 0.004
+
+
+FAULTS = {"frozen": _frozen, "clipped": _clipped, "without its sign": _without_sign, "slipped": _slipped}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: Path) -> None:
+    """None of these has a step that is too fast for the robot."""
+    joint_rad = _joints()
+    rows = _samples(joint_rad)
+    current = np.array([row.current_raw for row in rows])
+    FAULTS[kind](joint_rad, current)
+    moved = _samples(joint_rad)
+    rows = [replace(row, current_raw=tuple(own)) for row, own in zip(moved, current.tolist(), strict=True)]
+    log = _log(tmp_path / "a.mcap", rows)
+    with pytest.raises(DataError) as refused:
+        load_run(log)
+    assert refused.value.subject == f"{log}, axis J2"
+    described = info_report(log)
+    recorded = RecordedMotion(AXES)
+    for row in rows:
+        recorded.take(row)
+    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    reason = f"axis J2: {refused.value.found}"
+    assert (described.valid, described.reason) == (False, reason)
+    assert recorded.reason(CELL, readback, RATE_HZ) == reason
+
+
 def _with_current(rows: list[Sample], first: int, values: list[int]) -> list[Sample]:
     """Samples with other currents of the first axis from one of them on."""
     changed = list(rows)
@@ -197,7 +240,7 @@ def test_one_current_that_no_amplifier_sets_is_filled_in(tmp_path: Path) -> None
 def test_currents_that_no_amplifier_sets_are_refused_and_called_invalid(tmp_path: Path) -> None:
     rows = _samples(_joints())
     log = _log(tmp_path / "a.mcap", _with_current(rows, 1000, [2**28, 2**30, 2**29, -(2**28), 2**27]))
-    with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1 s; expected a current"):
+    with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1.001 s; expected a current"):
         load_run(log)
     described = info_report(log)
     assert not described.valid
