@@ -123,9 +123,25 @@ def find_faults(
         found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
         found += _current_faults(readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position)))
-    if usable is None:
-        return tuple(found)
-    return tuple(one for one in found if _is_in_use(one, usable))
+    return tuple(found) if usable is None else faults_in_use(found, usable)
+
+
+def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
+    """Return what is wrong with samples that count.
+
+    Args:
+        faults: of all samples.
+        usable: samples that count, shape (k, n).
+    """
+    found: list[ChannelFault] = []
+    for one in faults:
+        unused = np.cumsum(~usable[:, one.axis])
+        # A step is between two samples.
+        before = np.maximum(one.stretches[:, 0] - 2, 0)
+        is_in_use = unused[one.stretches[:, 1] - 1] == unused[before]
+        if np.any(is_in_use):
+            found.append(replace(one, stretches=one.stretches[is_in_use]))
+    return tuple(found)
 
 
 def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
@@ -135,13 +151,22 @@ def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
         position: of the joints, shape (k, n).
         ratio: R of the drive train, shape (n, n).
     """
-    motor_rad = position * np.diag(ratio)
-    for motor in np.flatnonzero(np.count_nonzero(ratio, axis=1) > 1).tolist():
-        turned = position @ ratio[motor]
-        largest = float(np.max(np.abs(position) @ np.abs(ratio[motor])))
-        # The sum over joints has rounding errors, with which nothing would repeat.
-        motor_rad[:, motor] = np.round(turned / largest, ROUNDED_DIGITS) * largest if largest else turned
+    motor_rad = np.empty_like(position)
+    for motor, row in enumerate(ratio):
+        joints = np.flatnonzero(row)
+        turned = position[:, joints] @ row[joints]
+        largest = float(np.max(np.abs(position[:, joints]) @ np.abs(row[joints])))
+        if len(joints) > 1 and largest > 0.0:
+            # The sum over joints has rounding errors, with which nothing would repeat.
+            turned = np.round(turned / largest, ROUNDED_DIGITS) * largest
+        motor_rad[:, motor] = turned
     return motor_rad
+
+
+def _turned_by(ratio: FloatArray) -> BoolArray:
+    """Whether each motor turns each joint, joints first, shape (n, n)."""
+    size = np.abs(np.linalg.inv(ratio))
+    return np.asarray(size > 1e-12 * size.max(), dtype=np.bool_)
 
 
 def _with_joints(
@@ -158,7 +183,7 @@ def _with_joints(
         rate_hz: sampling rate.
     """
     found = list(motors)
-    turned_by = np.linalg.inv(ratio) != 0.0
+    turned_by = _turned_by(ratio)
     coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
     for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
         own = [one for one in found if turned_by[joint, one.axis]]
@@ -200,15 +225,15 @@ def replaced_samples(
         shape: of the columns.
         ratio: R of the drive train, where the columns are joints, shape (n, n).
     """
-    to_joint = None if ratio is None else np.linalg.inv(ratio)
+    turned_by = None if ratio is None else _turned_by(ratio)
     marked = np.zeros(shape, dtype=np.bool_)
     for one in faults:
         is_replaced = one.is_filled or (one.quantity is ChannelKind.POSITION and one.is_left_out)
         if one.quantity is not quantity or not is_replaced:
             continue
         columns = np.array([one.axis])
-        if to_joint is not None:
-            columns = np.union1d(columns, np.flatnonzero(to_joint[:, one.axis]))
+        if turned_by is not None:
+            columns = np.union1d(columns, np.flatnonzero(turned_by[:, one.axis]))
         for first, end in one.stretches.tolist():
             marked[first:end, columns] = True
     return marked
@@ -361,10 +386,3 @@ def _without(readings: Readings, jumps: Jumps) -> Readings:
     for one in jumps.glitches:
         is_right[one.first : one.end] = False
     return replace(readings, values=readings.values[is_right], sample=readings.sample[is_right])
-
-
-def _is_in_use(fault: ChannelFault, usable: BoolArray) -> bool:
-    """Whether all samples of some stretch of a fault, and the one before, were to be used."""
-    unused = np.cumsum(~usable[:, fault.axis])
-    before = np.maximum(fault.stretches[:, 0] - 2, 0)
-    return bool(np.any(unused[fault.stretches[:, 1] - 1] == unused[before]))

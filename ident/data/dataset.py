@@ -8,7 +8,14 @@ from functools import partial
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
-from ident.data.channel_faults import ChannelFault, ChannelKind, find_faults, left_out_samples, replaced_samples
+from ident.data.channel_faults import (
+    ChannelFault,
+    ChannelKind,
+    faults_in_use,
+    find_faults,
+    left_out_samples,
+    replaced_samples,
+)
 from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.held import HeldChannels, fill_held
@@ -56,7 +63,7 @@ class Dataset:
     #: clipping was not looked for.
     clipped: BoolArray | None = None
     held: HeldChannels | None = None  #: channels whose held readings were filled in; None where none was held
-    #: What is wrong with single channels; glitches were filled in, what is frozen is not valid.
+    #: What is wrong with samples that count; glitches were filled in, what is frozen is not valid.
     faults: tuple[ChannelFault, ...] = ()
     is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 
@@ -134,7 +141,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
         clipped=clipped,
         held=held,
-        faults=faults,
+        faults=faults if usable is None else faults_in_use(faults, usable != 0.0),
     )
 
 

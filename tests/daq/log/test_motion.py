@@ -268,6 +268,7 @@ def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
     run, _ = load_run(log, lossy=LossyLogs.ACCEPTED)
     assert run.valid is not None
     assert not run.valid[1500:1540, 1].any()
+    assert _differentiated(run, CELL).faults == ()
     joint_rad[1540:, 1] += GLITCH_RAD  # 22 mrad for each of the 41 periods are too fast all the same
     wrong = write(
         tmp_path / "b.mcap",
