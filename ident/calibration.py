@@ -317,8 +317,8 @@ def calibration_of(
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
     gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
     responses = mass_responses(found.system, estimate)
-    passive = found.model.robot.undriven_names
-    places = (*axes, *passive)
+    undriven = found.model.robot.undriven_names
+    places = (*axes, *undriven)
     return Calibration(
         cell=robot,
         method=estimate.method.value,
@@ -340,7 +340,7 @@ def calibration_of(
         session_began_s=None if last is None else session_began_s(last.fit_runs),
         covariance_factor=factor_of(estimate.covariance),
         current_residual=found.current_residual,
-        passive_joints=passive,
+        passive_joints=undriven,
         payload_mass=tuple(
             PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist())
             for one in responses

@@ -12,9 +12,8 @@ the friction of the joints, which is found again because it changes with the tem
 
 σ has three parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`). Another, S C Sᵀ, is what
 the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ, c). The last is the tolerance u_k of the mass
-m_k of each payload that gave the calibration its scale, which C lacks: p moves by S ∂(g, χ, c)/∂m_k u_k, so that it
-adds
-the outer product of this vector with itself. Where that mass was all that was known, this is p u_k/m_k.
+m_k of each payload that gave the calibration its scale, which C lacks: p moves by the vector S ∂(g, χ, c)/∂m_k u_k, and
+its outer product with itself is added. Where that mass was all that was known, the vector is p u_k/m_k.
 """
 
 from __future__ import annotations

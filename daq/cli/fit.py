@@ -37,6 +37,7 @@ from daq.errors import OutputFailed, UsageError, writing
 from daq.files import replace_file
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
+from ident.physical.full_set import LARGEST_TOLERANCE, LEAST_TOLERANCE
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -149,8 +150,8 @@ class FitRequest(LogsRequest):
         float | None,
         typer.Option(
             "--prior-tolerance",
-            min=0.01,
-            max=0.5,
+            min=LEAST_TOLERANCE,
+            max=LARGEST_TOLERANCE,
             help="How far its masses and inertias may be off, one relative σ (0.1); alone: of the cell's URDF.",
         ),
     ] = None

@@ -235,10 +235,12 @@ class Cell:
     @property
     def place_units(self) -> tuple[JointUnit, ...]:
         """Unit of each of `place_names`."""
-        passive = () if self.chain is None else self.chain.passive_joints
-        pivots = () if self.chain is None else self.chain.pivots
-        kinds = [joint.kind for joint in passive] + [JointKind.REVOLUTE for _ in pivots]
-        return (*(axis.unit for axis in self.axes), *map(joint_unit, kinds))
+        axes = [axis.unit for axis in self.axes]
+        if self.chain is None:
+            return tuple(axes)
+        passive = [joint_unit(joint.kind) for joint in self.chain.passive_joints]
+        pivots = [joint_unit(JointKind.REVOLUTE)] * len(self.chain.pivots)
+        return (*axes, *passive, *pivots)
 
 
 def robot_of(cell: Cell) -> Robot:

@@ -32,6 +32,10 @@ class ClosureModel(StrictModel):
     ]
 
 
+STANDING = (0.0, 0.0, -9.81)
+"""Gravity of a robot that stands on its base [m/s²]."""
+
+
 class ChainModel(StrictModel):
     """Keys of a robot with closures, beside its URDF."""
 
@@ -78,8 +82,9 @@ def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
     passive = tuple(joint for joint in read_urdf(urdf).joints if joint.name not in robot.motors)
     chain = ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
-    closed = robot_with(chain, urdf, (0.0, 0.0, -9.81))
-    return replace(chain, pivots=closed.undriven_names[len(passive) :])
+    # Which closures are pivots does not depend on gravity.
+    closed = robot_with(chain, urdf, STANDING)
+    return replace(chain, pivots=closed.pivot_names)
 
 
 def platform_frame(robot: ChainModel, urdf: str) -> Place:

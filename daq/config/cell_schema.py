@@ -231,7 +231,7 @@ class ConditioningModel(StrictModel):
     decimation_cutoff_hz: _CutOff = 20.0
     standstill_rad_s: tuple[Annotated[float, Field(ge=0, le=1e3)] | None, ...] = ()
     standstill_mm_s: tuple[Annotated[float, Field(ge=0, le=SPEED[1])] | None, ...] = ()
-    standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.05
+    standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
 class PolicyModel(StrictModel):

@@ -251,11 +251,11 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
         return
     from daq.config.effects import place_effect  # noqa: PLC0415 - loads scipy, which cells without effects do not need
 
-    passive = () if robot is None else robot.undriven_names
-    names = [*model.axis_names, *passive]
+    undriven = () if robot is None else robot.undriven_names
+    names = [*model.axis_names, *undriven]
     placed = [(effect.name, effect.axis) for effect in model.effects]
     for index, effect in enumerate(model.effects):
-        if effect.axis not in names and not (model.closures and not passive):
+        if effect.axis not in names and not (model.closures and not undriven):
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
             yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")

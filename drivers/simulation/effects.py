@@ -377,6 +377,7 @@ OF_MOTORS = (
 
 PIVOT_FRICTION = "pivot-friction"
 """Friction of a closure, which is on no axis and no joint of the tree."""
+PLACES = ("moment", "axis", "closure")  #: Arguments of an effect's physics that are no parameters of its own
 
 
 def _pivot_friction(effect: UndeclaredEffect) -> PivotFriction:
@@ -387,12 +388,23 @@ def _pivot_friction(effect: UndeclaredEffect) -> PivotFriction:
     """
     if effect.closure is None:
         raise SpecInvalid(f"{PIVOT_FRICTION}: no closure; name the one that the pivot closes")
-    unknown = sorted(set(effect.parameters) - {"coulomb_nm", "viscous_nm_s_rad"})
-    if unknown:
-        raise SpecInvalid(
-            f"{PIVOT_FRICTION}: unknown parameter {', '.join(unknown)}; its parameters are coulomb_nm, viscous_nm_s_rad"
-        )
+    _require_parameters(effect, PivotFriction)
     return PivotFriction(effect.closure, **effect.parameters)
+
+
+def _require_parameters(effect: UndeclaredEffect, physics: Callable[..., object]) -> None:
+    """Refuse parameters that the physics of an effect does not have, and missing ones.
+
+    Raises:
+        SpecInvalid: with all of them, and those that there are.
+    """
+    known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in PLACES}
+    unknown = sorted(set(effect.parameters) - set(known))
+    missing = [name for name, default in known.items() if default is Parameter.empty and name not in effect.parameters]
+    wrong = [f"unknown parameter {', '.join(unknown)}"] if unknown else []
+    wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
+    if wrong:
+        raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
 
 
 def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] = ()) -> Effect | Lag:
@@ -424,13 +436,7 @@ def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] =
         joint = axes + passive.index(effect.joint)
     elif not 0 <= effect.axis < axes:
         raise SpecInvalid(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
-    known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in ("moment", "axis")}
-    unknown = sorted(set(effect.parameters) - set(known))
-    missing = [name for name, default in known.items() if default is Parameter.empty and name not in effect.parameters]
-    wrong = [f"unknown parameter {', '.join(unknown)}"] if unknown else []
-    wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
-    if wrong:
-        raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
+    _require_parameters(effect, physics)
     other_axis = effect.parameters.get("other_axis")
     if other_axis is not None and (other_axis not in range(1, axes + 1) or other_axis == joint + 1):
         raise SpecInvalid(f"{effect.name}: other_axis {other_axis:g} is not another axis from 1 to {axes}")

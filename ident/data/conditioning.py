@@ -26,9 +26,7 @@ class Conditioning:
     #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty, it is derived from
     #: each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
-    #: A row is left out when standstill fills more than this share of its filter window. A joint at rest holds any
-    #: torque up to its dry friction: with 0.1, rows beside a stop carry enough of it to look like presliding.
-    standstill_share: float = 0.05
+    standstill_share: float = 0.1  #: a row is left out when standstill fills more than this share of its filter window
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.discovery.beside_stops import clear_of_stops, turns_with_motion
 from ident.discovery.braking import pushing
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.evidence import (
@@ -117,7 +118,18 @@ def join(
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
     last = accepted.placed
     why = "" if pruned is joined else refuted_by_instruments(pruned.evidence, last)
+    why = why or refuted_clear_of_stops(pruned, last, rng, gates)
     return SetAside(accepted, why) if why else pruned
+
+
+def refuted_clear_of_stops(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> str:
+    """Why an effect of a joint fit may be friction of joints at rest; empty where it may not."""
+    if not turns_with_motion(placed.effect):
+        return ""
+    (own,) = rng.spawn(1)  # the draws of the search stay what they are
+    clear = clear_of_stops(model.search_problem, model.evidence.estimate)
+    _, why = beside_others(replace(model, search_problem=clear), placed, own, gates)
+    return f"in rows that are clear of stops, {why}" if why else ""
 
 
 def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAside]) -> SetAside | None:

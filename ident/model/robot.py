@@ -78,7 +78,7 @@ class Robot:
     platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
     #: Gravity before its direction was corrected, shape (3,); None where it was not.
     declared_gravity_m_s2: FloatArray | None = None
-    #: Joints at which loops are cut and in which friction can be told from that of every joint of the tree.
+    #: Joints at which loops are cut, without those in which friction is the same as in a joint of the tree.
     pivots: tuple[Pivot, ...] = ()
 
     @property
@@ -135,9 +135,14 @@ class Robot:
         return tuple(self.joints[joint].name for joint in self.passive_joints)
 
     @property
+    def pivot_names(self) -> tuple[str, ...]:
+        """Names of the pivots, each after its closure."""
+        return tuple(self._as_joint(pivot).name for pivot in self.pivots)
+
+    @property
     def undriven_names(self) -> tuple[str, ...]:
-        """Names of the places without a motor, in the order of `places`; a pivot is named after its closure."""
-        return tuple(joint.name for joint in self.places[self.axis_count :])
+        """Names of the places without a motor, in the order of `places`."""
+        return (*self.passive_names, *self.pivot_names)
 
     @property
     def axis_count(self) -> int:

@@ -53,11 +53,9 @@ from ident.estimators.estimate import Estimate
 from ident.model.bodies import link_parameters, pseudo_inertia
 from ident.model.model import Model
 from ident.physical.consistency import MARGIN, NotPhysical, consistency_of, relative_to_prior, solve_programme
+from ident.physical.full_set import LARGEST_TOLERANCE, LEAST_TOLERANCE
 from ident.physical.prior_check import PriorCheck, check_prior
 
-LEAST_TOLERANCE = 0.01
-LARGEST_TOLERANCE = 0.5
-"""Above it, a link of the prior's distribution is often no possible body: first order in t is not enough."""
 _DEPENDENT = 1e-10  #: Diagonal of R, of columns of norm one, below which an unknown is not determined
 _LOOSE = 1e-9  #: Singular value, of columns of norm one, relative to the largest, that is none
 _ROOM = 1e-6  #: Least value of what may not be negative, in units of its scale: above the solver's tolerance

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+LEAST_TOLERANCE = 0.01  #: Of a prior
+LARGEST_TOLERANCE = 0.5
+"""Above it, a link of the prior's distribution is often no possible body: first order in t is not enough."""
+
 
 @dataclass(frozen=True, slots=True)
 class FullParameter:
@@ -21,7 +25,7 @@ class FullParameter:
 
 @dataclass(frozen=True, slots=True)
 class GainWithPrior:
-    """What the prior would make of a gain; it is written nowhere."""
+    """What the prior would make of a gain; no controller gets it."""
 
     axis: str  #: name of the axis
     value: float  #: [unit of the gain]

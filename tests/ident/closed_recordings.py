@@ -82,8 +82,7 @@ def recorded(
     for joint in model.robot.axis_joints:
         standard[14 * joint + 10 : 14 * joint + 14] = 0.02, 0.3, 0.4, 0.05
     payload = _body(rng, 2.0)
-    # No joint of these recordings sticks: rows beside a standstill are as good as others.
-    conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count, standstill_share=0.1)
+    conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
     rng, runs = np.random.default_rng(seed), []
     for mounted in (None, MOUNTED):
         drawn = axis_positions(mechanism, rng, seconds, share)

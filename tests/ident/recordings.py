@@ -36,8 +36,7 @@ PAYLOAD_TRUTH = dict(
     zip(LINK_PARAMETERS, (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59), strict=True)
 )
 MOUNTED = Payload("disc", "a", {"m": 4.59})
-CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6, standstill_share=0.1)
-"""In these recordings no joint sticks, so rows beside a standstill are as good as others: more of them may stay."""
+CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6)
 
 
 @dataclass(frozen=True)
@@ -240,8 +239,9 @@ def calibrated(evidence: Evidence) -> Calibration:
     whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
     references = []
     for one in mass_responses(evidence.identification.system, estimate):
-        slopes = one.gain_per_kg.tolist(), one.parameters_per_kg.tolist()
-        references.append(PayloadMass.of(one.payload, one.mass_kg, slopes[0], whole.gains, slopes[1]))
+        gain_per_kg = one.gain_per_kg.tolist()
+        parameters_per_kg = one.parameters_per_kg.tolist()
+        references.append(PayloadMass.of(one.payload, one.mass_kg, gain_per_kg, whole.gains, parameters_per_kg))
     return replace(
         whole,
         payload_mass=tuple(references),

@@ -20,7 +20,6 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,6 +42,7 @@ from tests.studies.output import as_csv
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS, world_cell
 from tests.studies.study_plans import CELL, make_plan
+from tests.studies.study_rows import with_tuples
 
 OUT = Path("out/effects-study")
 VARIABLES = {
@@ -190,7 +190,8 @@ def study(
         for line in lines:
             _print_line(line)
     paths = [task.path(name) for task in tasks for name in task.parts]
-    return with_floors([_row_of(json.loads(path.read_text())) for path in paths if path.is_file()])
+    documents = [json.loads(path.read_text()) for path in paths if path.is_file()]
+    return with_floors([Row(**with_tuples(document)) for document in documents])
 
 
 def with_floors(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -274,14 +275,6 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
         iv_gain_error_percent=() if refitted is None else _gains_of(refitted, truth)[0],
         iv_gain_std_percent=() if refitted is None else _gains_of(refitted, truth)[1],
     )
-
-
-def _row_of(document: dict[str, Any]) -> Row:
-    """Rebuild a row read back from JSON."""
-    fields: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
-    }
-    return Row(**fields)
 
 
 def _holdout(evidence: Evidence, axis: int | None) -> float:

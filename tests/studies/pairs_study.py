@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -42,8 +41,9 @@ from tests.studies.fingerprint import digest, digest_of_source, finish, is_finis
 from tests.studies.followed_cell import follow, point_to_point
 from tests.studies.output import as_csv, print_line
 from tests.studies.side_by_side import Shard, shard
-from tests.studies.study_cells import WORLDS, declared_payload, spec_of, world_cell
+from tests.studies.study_cells import declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
+from tests.studies.study_rows import with_tuples
 
 OUT = Path("out/pairs")
 ARM_SEED = 7001  #: Its truth; no cell of another study has it
@@ -181,14 +181,7 @@ def make_scores(
 def load_scores(folder: Path, world: str) -> tuple[RecordingScore, ...]:
     """Scores of a world that are there, by number."""
     documents = [json.loads(path.read_text()) for path in sorted((folder / world).glob("*.json"))]
-    return tuple(_score_of(document) for document in documents)
-
-
-def _score_of(document: dict[str, Any]) -> RecordingScore:
-    fields: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in document.items()
-    }
-    return RecordingScore(**fields)
+    return tuple(RecordingScore(**with_tuples(document)) for document in documents)
 
 
 def disjoint_pairs(scores: Sequence[RecordingScore]) -> tuple[tuple[RecordingScore, RecordingScore], ...]:
@@ -270,7 +263,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--tables", type=Path, help="folder for the table as CSV")
     options = parser.parse_args(arguments)
-    assert set(PAIR_WORLDS) <= set(WORLDS)
     # Worlds in turn, so that an interrupted study has as many recordings of each.
     tasks = [
         RecordingTask(options.out, world, number) for number in range(options.recordings) for world in options.world

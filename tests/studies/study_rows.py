@@ -54,6 +54,14 @@ def from_csv(kind: type[Row], text: str) -> tuple[Row, ...]:
     return tuple(rows)
 
 
+def with_tuples(document: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a row that was read back from JSON, with tuples in the place of lists."""
+    fields_of_row: dict[str, Any] = {}
+    for name, value in document.items():
+        fields_of_row[name] = tuple(value) if isinstance(value, list) else value
+    return fields_of_row
+
+
 def _to_text(value: object) -> str:
     if isinstance(value, tuple):
         return SEPARATOR.join(_to_text(entry) for entry in value)

@@ -90,13 +90,14 @@ def test_without_current_noise_only_standstill_biases_the_gains(truth: Truth, cl
     assert never > 1e-2
 
 
-def test_rows_that_count_hold_little_of_the_friction_at_rest(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    # By the exact positions, which know nothing of the low-pass and of the standstill speed.
-    loose = replace(DERIVED, standstill_share=0.1)
+def test_no_row_that_counts_holds_more_rest_than_its_share(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    # By the exact positions: the low-pass must not let a joint that rests pass for a moving one.
+    strict = replace(DERIVED, standstill_share=0.05)
     for run in clean_runs:
-        least, most = (_largest_share_of_rest(truth, run, choice) for choice in (DERIVED, loose))
-        assert least < 0.02
-        assert most > 1.5 * least
+        least = _largest_share_of_rest(truth, run, strict)
+        most = _largest_share_of_rest(truth, run, DERIVED)
+        assert least <= strict.standstill_share
+        assert least < most <= DERIVED.standstill_share
 
 
 def _largest_share_of_rest(truth: Truth, run: Run, conditioning: Conditioning) -> float:
