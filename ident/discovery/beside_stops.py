@@ -12,17 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.discovery.candidates import SearchProblem, folds_around
+from ident.discovery.evidence import Evidence, fixed_gains
 from ident.effects.effect import Effect, Property
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
+from ident.equations.observation import Observation
 from ident.equations.rows import row_masks
 from ident.estimators.estimate import Estimate
+from ident.estimators.identify import estimate_with
 
-CLEAR_SHARE = 0.05
-"""Largest share of standstill in the filter window of a row that is clear of stops.
-
-With 0.02 it silences the same clean cells, and leaves fewer rows (docs/evidence/effects-study.md)."""
+CLEAR_SHARE = 0.5
+"""Largest share of standstill in the window of a row that is clear of stops, in parts of what the cell allows."""
 
 
 def turns_with_motion(effect: Effect) -> bool:
@@ -32,21 +32,21 @@ def turns_with_motion(effect: Effect) -> bool:
     return effect.declares is Property.ODD_IN_VELOCITY
 
 
-def clear_of_stops(search_problem: SearchProblem, estimate: Estimate) -> SearchProblem:
-    """Linearise a problem around its estimate again, with those rows alone that are clear of stops.
+def rows_clear_of_stops(evidence: Evidence) -> Observation:
+    """Rows of the fit, of which those alone count that are clear of stops."""
+    rows = evidence.training
+    allowed = evidence.conditioning.standstill_share
+    conditioning = replace(evidence.conditioning, standstill_share=CLEAR_SHARE * allowed)
+    masks = [row_masks(evidence.model, data, conditioning) for data in evidence.fit_runs]
+    use = np.concatenate([of_joints for of_joints, _ in masks], axis=1)
+    motor_use = np.concatenate([of_motors for _, of_motors in masks], axis=1)
+    return replace(rows, use=rows.use & use, motor_use=rows.motor_use & motor_use)
 
-    Args:
-        search_problem: linearised around the estimate.
-        estimate: by ``ml``.
+
+def fitted_clear_of_stops(evidence: Evidence) -> Estimate:
+    """Estimate the same model, effects included, from rows that are clear of stops.
 
     Raises:
-        TooFewMoves: there are too few moves to leave some out.
+        RankDeficient, NotConverged: these rows do not determine it.
     """
-    rows = search_problem.observation
-    conditioning = replace(rows.conditioning, standstill_share=min(CLEAR_SHARE, rows.conditioning.standstill_share))
-    masks = [row_masks(search_problem.model, data, conditioning) for data in search_problem.datasets]
-    of_joints = np.concatenate([of_joints for of_joints, _ in masks], axis=1)
-    of_motors = np.concatenate([of_motors for _, of_motors in masks], axis=1)
-    clear = replace(rows, use=rows.use & of_joints, motor_use=rows.motor_use & of_motors)
-    folds, step = folds_around(search_problem.model, clear, estimate)
-    return replace(search_problem, observation=clear, folds=folds, step=step)
+    return estimate_with(evidence.estimate.method, rows_clear_of_stops(evidence).system(), fixed_gains(evidence))

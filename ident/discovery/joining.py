@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.beside_stops import clear_of_stops, turns_with_motion
+from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
 from ident.discovery.braking import pushing
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
 from ident.discovery.evidence import (
@@ -50,10 +50,10 @@ from ident.effects.geometry_corrections import LatePosition, is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
+from ident.estimators.estimate import Estimate
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
-LEFT_OF_SIZE = 0.5  #: Of the least share that an effect of friction explains, where rows are clear of stops
 REFINEMENTS = 4  #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
 
 
@@ -119,19 +119,23 @@ def join(
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
     last = accepted.placed
     why = "" if pruned is joined else refuted_by_instruments(pruned.evidence, last)
-    why = why or refuted_clear_of_stops(pruned, last, rng, gates)
+    why = why or refuted_clear_of_stops(pruned.evidence, last)
     return SetAside(accepted, why) if why else pruned
 
 
-def refuted_clear_of_stops(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> str:
-    """Why an effect of a joint fit may be friction of joints at rest; empty where it may not."""
+def refuted_clear_of_stops(evidence: Evidence, placed: PlacedEffect) -> str:
+    """Why an effect of a joint fit may be friction of joints at rest alone; empty where it may not.
+
+    In rows that are clear of stops it is then nearer to zero than to the fit. Rows that would not show an effect of
+    that size refute nothing.
+    """
     if not turns_with_motion(placed.effect):
         return ""
-    (own,) = rng.spawn(1)  # the draws of the search stay what they are
-    clear = clear_of_stops(model.search_problem, model.evidence.estimate)
-    # Near stops friction shows best: clear of them it may explain less.
-    smaller = replace(gates, explained=LEFT_OF_SIZE * gates.explained, error_fall=LEFT_OF_SIZE * gates.error_fall)
-    _, why = beside_others(replace(model, search_problem=clear), placed, own, smaller)
+    try:
+        clear = fitted_clear_of_stops(evidence)
+    except UNFITTED:
+        return ""
+    why = _contradicted_by(clear, evidence, placed)
     return f"in rows that are clear of stops, {why}" if why else ""
 
 
@@ -264,20 +268,25 @@ def refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
         return ""
     if estimate is None:
         return ""
-    own = own_unknowns(estimate, (placed,))
-    place = len(estimate.gains) + own
-    values = values_of(estimate, own)
-    fitted = values_of(evidence.estimate, own)
-    why = _contradiction(placed, values, fitted, estimate.covariance[np.ix_(place, place)])
+    why = _contradicted_by(estimate, evidence, placed)
     return f"with instruments from the demanded motion, {why}" if why else ""
 
 
+def _contradicted_by(other: Estimate, evidence: Evidence, placed: PlacedEffect) -> str:
+    """Why another estimate of the same unknowns contradicts an effect of a joint fit; empty where it does not."""
+    own = own_unknowns(other, (placed,))
+    place = len(other.gains) + own
+    values = values_of(other, own)
+    fitted = values_of(evidence.estimate, own)
+    return _contradiction(placed, values, fitted, other.covariance[np.ix_(place, place)])
+
+
 def _contradiction(placed: PlacedEffect, values: FloatArray, fitted: FloatArray, covariance: FloatArray) -> str:
-    """Why coefficients by instruments contradict those of a fit; empty where they do not.
+    """Why coefficients of another estimate contradict those of a fit; empty where they do not.
 
     Args:
         placed: the effect.
-        values: of its coefficients by instruments, shape (p,).
+        values: of its coefficients by the other estimate, shape (p,).
         fitted: the same of the fit.
         covariance: of the values, shape (p, p).
     """

@@ -127,7 +127,7 @@ def find_effects(
     7. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
        the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
        not make a named effect leave: then it does not join;
-    8. asks whether what turns with the motion passes in rows that are clear of stops, too (`clear_of_stops`).
+    8. asks whether what turns with the motion passes in rows that are clear of stops, too (`refuted_clear_of_stops`).
 
     What parts left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
     ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.beside_stops import CLEAR_SHARE, clear_of_stops, turns_with_motion
+from ident.discovery.beside_stops import CLEAR_SHARE, rows_clear_of_stops, turns_with_motion
 from ident.discovery.evidence import Evidence, with_effects
-from ident.discovery.gates import Gates
-from ident.discovery.joining import linearised, refuted_clear_of_stops
+from ident.discovery.joining import refuted_clear_of_stops
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Lag
 from ident.effects.friction import Presliding, Stribeck
@@ -25,12 +24,12 @@ FloatArray = NDArray[np.float64]
 AXIS = 1
 AMOUNT_NM = 6.0
 PLACED = PlacedEffect(Presliding(0.04), AXIS)
-GATES = Gates(draws=199)
 
 
 def _clear_rows(evidence: Evidence) -> NDArray[np.bool_]:
-    """Rows of each joint that hold no more than CLEAR_SHARE of standstill, shape (n, r)."""
-    strict = replace(evidence.conditioning, standstill_share=CLEAR_SHARE)
+    """Rows of each joint that hold no more standstill than a row that is clear of stops, shape (n, r)."""
+    allowed = evidence.conditioning.standstill_share
+    strict = replace(evidence.conditioning, standstill_share=CLEAR_SHARE * allowed)
     masks = [row_masks(evidence.model, data, strict)[0] for data in evidence.datasets]
     return np.concatenate(masks, axis=1)
 
@@ -47,7 +46,7 @@ def _refuted(small: Evidence, truth: Truth, torque_nm: FloatArray) -> str:
     of_joints[AXIS] = torque_nm
     added_a = truth.model.drive_train.to_motor @ of_joints / truth.gains[:, None]
     joined = with_effects(with_current(small, added_a), (PLACED,))
-    return refuted_clear_of_stops(linearised(joined, {}), PLACED, np.random.default_rng(0), GATES)
+    return refuted_clear_of_stops(joined, PLACED)
 
 
 def test_presliding_that_acts_in_all_rows_joins(small: Evidence, small_truth: Truth) -> None:
@@ -62,19 +61,10 @@ def test_what_only_rows_beside_stops_hold_is_refused(small: Evidence, small_trut
 
 
 def test_rows_that_are_clear_are_those_of_a_smaller_share_of_standstill(small: Evidence) -> None:
-    problem = search_problem_of(small)
-    clear = clear_of_stops(problem, small.estimate).observation
-    expected = problem.observation.use & _clear_rows(small)
-    assert np.array_equal(clear.use, expected)
-    assert clear.use.sum() < problem.observation.use.sum()
-
-
-def test_a_cell_that_declares_a_smaller_share_keeps_its_rows(small: Evidence) -> None:
-    declared = replace(small.training.conditioning, standstill_share=1e-6)
-    problem = search_problem_of(small)
-    problem = replace(problem, observation=replace(problem.observation, conditioning=declared))
-    clear = clear_of_stops(problem, small.estimate).observation
-    assert np.all(clear.use <= _clear_rows(small))
+    clear = rows_clear_of_stops(small)
+    assert np.array_equal(clear.use, small.training.use & _clear_rows(small))
+    assert clear.use.sum() < small.training.use.sum()
+    assert clear.motor_use.sum() < small.training.motor_use.sum()
 
 
 @pytest.mark.parametrize(
