@@ -48,7 +48,7 @@ help:
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
 	@echo "make real-study  effects found on real robots, judged where the arm was elsewhere (docs/evidence/real.md); needs the recordings; resumable, half an hour"
 	@echo "make geometry-study  wrong zeros, tilted gravity and late signals on four robots: named, and the gains; resumable, hours"
-	@echo "make damage-study  held readings of a real arm, and a drive that gives less than its reference asks for; minutes"
+	@echo "make damage-study  held readings of a real arm, a drive that gives less than asked, faults of channels; half an hour"
 	@echo "make session-study  motion and errors of a guided session beside the way step by step (docs/evidence/session.md); resumable, hours"
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
 	@echo "make stopping-study  gains and their error bars where a recording ends as soon as every error bar is at its target (docs/evidence/stopping.md); resumable, ten minutes"
