@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -55,6 +55,7 @@ help:
 	@echo "make warm-up-study  how far friction that falls while the arm warms up bends the gains, by the order of blocks; resumable, an hour"
 	@echo "make prior-study  full parameters under right and wrong priors: coverage, and what is noticed (docs/evidence/prior.md); resumable, twenty minutes"
 	@echo "make pairs-study  gains of independent recordings of one arm beside their error bars, after the search (docs/evidence/pairs.md); resumable, hours"
+	@echo "make planner-study  error bars that the planner predicts beside those of the fit, slow noise too (docs/evidence/planning.md); minutes"
 	@echo "make contact-study  false alarms an hour and height of the thresholds of contact (docs/evidence/contact.md); minutes"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
@@ -196,6 +197,9 @@ session-study: setup
 
 pairs-study: setup
 	$(BIN)/python -m tests.studies.pairs_study --tables docs/evidence/data
+
+planner-study: setup
+	$(BIN)/python -m tests.studies.planner_study --tables docs/evidence/data
 
 contact-study: setup
 	$(BIN)/python -m tests.studies.contact_study --tables docs/evidence/data

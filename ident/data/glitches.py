@@ -31,6 +31,9 @@ LEAST_CHANGES = 20  #: Of a channel that shows its counts: those of an axis at r
 NEAR, FAR = 5, 14  #: Steps around a jump that are compared with it, from and to, on either side
 SHORT = 3  #: Readings that a glitch of any shape may have
 LONGEST_S = 0.05  #: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
+USUAL_PERCENTILES = 1.0, 99.0
+"""Their distance is the usual range of a current. A short glitch of a current is larger: what a controller asks for
+where a joint breaks loose may last one reading, and nothing tells it from a smaller glitch, which bends no gain."""
 RETURN = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
 RETURNED = 2  #: Readings after it that are on the course; what rings on is a blow to the robot
 SAME_SIZE = 0.05  #: Largest relative difference of the steps of a counter that wraps
@@ -84,11 +87,12 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
     """
     step, size = _jumps(readings, POSITION_PERCENTILE if is_position else CURRENT_PERCENTILE)
     longest = max(SHORT, round(LONGEST_S * readings.rate_hz))
+    least = 0.0 if is_position else float(np.ptp(np.percentile(readings.values, USUAL_PERCENTILES)))
     glitches: list[Glitch] = []
     left: list[int] = []
     number = 0
     while number < len(step):
-        found = _glitch_from(readings, step[number:], size[number:], longest, is_position=is_position)
+        found = _glitch_from(readings, step[number:], size[number:], longest, least, is_position=is_position)
         if found is None:
             left.append(number)
             number += 1
@@ -152,15 +156,24 @@ def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]
 
 
 def _glitch_from(
-    readings: Readings, step: IntArray, size: FloatArray, longest: int, *, is_position: bool
+    readings: Readings, step: IntArray, size: FloatArray, longest: int, least: float, *, is_position: bool
 ) -> tuple[Glitch, int] | None:
-    """Return the glitch that begins with the first of the jumps, and how many of the jumps belong to it."""
+    """Return the glitch that begins with the first of the jumps, and how many of the jumps belong to it.
+
+    Args:
+        readings: of the channel.
+        step, size: of the jumps that are left, as of `_jumps`.
+        longest: glitch, in samples.
+        least: size of a glitch of SHORT readings or fewer.
+        is_position: as of `find_jumps`.
+    """
     values = readings.values
     begin = int(step[0])
     leaves = float(size[0])
     motion = float(values[begin + 1] - values[begin]) - leaves
     last = len(values) - 1
-    if begin < SHORT and (len(step) == 1 or step[1] - begin > longest):
+    # A current steps where friction turns; one that does so beside an end of the recording need not return.
+    if is_position and begin < SHORT and (len(step) == 1 or step[1] - begin > longest):
         return Glitch(0, begin + 1, abs(leaves)), 1
     for number in range(1, len(step)):
         end = int(step[number])
@@ -172,10 +185,11 @@ def _glitch_from(
         if np.max(np.abs(off)) > RETURN * abs(leaves):
             continue
         inside = values[begin + 1 : end + 1]
-        is_repeated = np.ptp(inside) == 0.0
-        if samples <= SHORT or is_position or is_repeated:
+        is_short = samples <= SHORT and abs(leaves) > least
+        is_dropout = samples > SHORT and np.ptp(inside) == 0.0
+        if is_position or is_short or is_dropout:
             return Glitch(begin + 1, end + 1, abs(leaves)), number + 1
-    if last - begin <= SHORT:
+    if is_position and last - begin <= SHORT:
         return Glitch(begin + 1, last + 1, abs(leaves)), len(step)
     return None
 

@@ -147,6 +147,17 @@ def test_a_current_where_a_joint_breaks_loose_is_no_glitch() -> None:
     assert find_faults(position, current, RATE_HZ) == ()
 
 
+@pytest.mark.parametrize("sample", [1, 5998])
+def test_a_current_that_steps_beside_an_end_of_the_recording_is_no_glitch(sample: int) -> None:
+    """Friction turned there: nothing says that the current would return."""
+    position, current = planted(lambda _: None)
+    if sample == 1:
+        current[:sample, 1] -= 5.0
+    else:
+        current[sample:, 1] += 5.0
+    assert find_faults(position, current, RATE_HZ) == ()
+
+
 def test_glitches_in_too_many_samples_are_refused() -> None:
     def change(channel: FloatArray) -> None:
         channel[100:5000:40] += 3.0
