@@ -7,21 +7,22 @@ these are many, they are tried on the joint itself first, and proposed only wher
 gates require. For backlash, pairs of gap and compliance are tried where the residual gathers at turns of the torque,
 and the neighbours of the best pair are proposed.
 
-Each is proposed in two forms: the link's friction acts as the motor moves, or holds the link by itself until the gear
-pushes it (`ident.effects.twist`). Where the mass matrix of an axis contains the rotor, which does not move behind the
-gear, some shares of it are tried as the rotor's inertia.
+What was chosen gets its form and its finer settings in `refined_gear`: the link's friction acts as the motor moves, or
+holds the link by itself until the gear pushes it (`ident.effects.twist`). Where the mass matrix of an axis contains the
+rotor, which does not move behind the gear, some shares of it are tried as the rotor's inertia.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
 from ident.discovery.gates import Gates
+from ident.discovery.refinement import is_strictly_possible
 from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
 from ident.effects.effect import Effect
 from ident.effects.rotor import beside_rotor
@@ -38,22 +39,11 @@ DAMPING_RATIOS = (0.1, 0.25)
 HALF_GAPS_RAD = (2e-4, 3.2e-4, 5e-4, 8e-4, 1.3e-3, 2e-3, 3.2e-3, 5e-3, 8e-3)
 FLANKS_HZ = (15.0, 25.0, 40.0)
 FLANK_DAMPING = 0.2
-HELD_DAMPING = (0.25, 0.1, 0.5)
-"""Damping ratios of links that their friction holds; all springs and gaps are tried with the first."""
-FLANK_FACTORS = (0.62, 0.79, 1.0, 1.27, 1.6)
-"""Of the compliance of the best flank; those of neighbours in the list are 2.7."""
-NEAR_FACTORS = (0.72, 0.85, 1.0, 1.18, 1.4)  #: Of the compliance of the best spring: its neighbours in the list are 1.8
+HELD_DAMPING = (0.1, 0.25, 0.5)
+NEAR_FACTORS = (0.5, 0.62, 0.79, 1.0, 1.27, 1.6, 2.0)  #: Of the compliance that was chosen
+GAP_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)  #: Of the gap that was chosen
 ROTOR_SHARES = (0.0, 0.25, 0.5, 0.75)  #: Of the largest inertia that the rotor of an axis can have
 SCREENED = 0.5  #: Share of the gates' least share below which nothing is proposed
-
-
-@dataclass(frozen=True, slots=True)
-class Tried:
-    """A gear that is tried on a joint."""
-
-    effect: Elasticity | Backlash  #: with the setting of the gear
-    frequency: int  #: place of its resonance in the list of frequencies
-    share: float  #: that it explains, of a motor's squared residual
 
 
 def propose_resonances(
@@ -86,82 +76,70 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
     if max(shares_explained(search_problem, _tried(search_problem, axis, bent))) < least:
         return ()
     plain = [Elasticity(one, ratio) for ratio in DAMPING_RATIOS for one in compliances]
-    return (Elasticity(), *plain, *_held_springs(search_problem, axis, inertia))
-
-
-def _held_springs(search_problem: SearchProblem, axis: int, inertia: float) -> list[Effect]:
-    """Springs behind which friction holds the link: the best compliance, damping and rotor, and its neighbours."""
-    tried: list[Tried] = []
-    for rotor in _rotors(search_problem, axis):
-        coarse = [Elasticity(one, HELD_DAMPING[0], 1, rotor) for one in _compliances(inertia - rotor, FREQUENCIES_HZ)]
-        best = max(_explained(search_problem, axis, coarse, range(len(coarse))), key=lambda one: one.share)
-        near = [_rounded(best.effect.resonant_rad_nm * factor) for factor in NEAR_FACTORS]
-        for ratio in HELD_DAMPING:
-            fine = [Elasticity(compliance, ratio, 1, rotor) for compliance in near]
-            tried += _explained(search_problem, axis, fine, range(len(fine)))
-    best = max(tried, key=lambda one: one.share)
-    return [one.effect for one in tried if _differs_in_compliance(one, best)]
-
-
-def _differs_in_compliance(one: Tried, best: Tried) -> bool:
-    """Whether a spring is the best one, or its neighbour with the same damping and rotor."""
-    alike = best.effect.with_settings({"resonant_rad_nm": one.effect.resonant_rad_nm})
-    return alike == one.effect and abs(one.frequency - best.frequency) <= 1
+    return (Elasticity(), *plain)
 
 
 def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: float) -> tuple[Effect, ...]:
     if _gathered_at_turns(search_problem, axis) < least:
         return ()
-    chosen: list[Effect] = []
+    pairs = [(gap, one) for one in _compliances(inertia, FLANKS_HZ) for gap in HALF_GAPS_RAD]
+    gears = [Backlash(0.0, gap, one, FLANK_DAMPING) for gap, one in pairs]
+    shares = _explained(search_problem, axis, gears)
+    best = int(np.argmax(shares))
+    if shares[best] < least:
+        return ()
+    flank, place = divmod(best, len(HALF_GAPS_RAD))
+    near = [(flank, place + step) for step in (-1, 0, 1)] + [(flank + step, place) for step in (-1, 1)]
+    return tuple(
+        gears[len(HALF_GAPS_RAD) * row + column]
+        for row, column in near
+        if 0 <= row < len(FLANKS_HZ) and 0 <= column < len(HALF_GAPS_RAD)
+    )
+
+
+def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
+    """Return a gear that is not rigid in the form, and with the settings, that explain most; any other effect as it is.
+
+    Both forms are tried: a link whose friction acts as its motor moves, and one that its own friction holds.
+
+    Args:
+        search_problem: around the model without the effect.
+        effect: that was chosen.
+        axis: index of its joint.
+    """
+    if not isinstance(effect, Elasticity | Backlash) or not effect.resonant_rad_nm > 0.0:
+        return effect
+    forms: list[Effect] = [effect]
     for held in (0, 1):
-        tried: list[Tried] = []
+        tried: list[Elasticity | Backlash] = []
+        shares: list[float] = []
         for rotor in _rotors(search_problem, axis) if held else (0.0,):
-            pairs = [
-                (frequency, Backlash(0.0, gap, compliance, FLANK_DAMPING, held, rotor))
-                for frequency, compliance in enumerate(_compliances(inertia - rotor, FLANKS_HZ))
-                for gap in HALF_GAPS_RAD
-            ]
-            gears = [gear for _, gear in pairs]
-            tried += _explained(search_problem, axis, gears, [frequency for frequency, _ in pairs])
-        best = max(tried, key=lambda one: one.share)
-        if best.share < least:
+            for ratio in HELD_DAMPING if held else (effect.damping_ratio,):
+                form = replace(effect, held=held, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
+                gears = _around(form)
+                tried += gears
+                shares += _explained(search_problem, axis, gears)
+        forms.append(tried[int(np.argmax(shares))])
+    trials = search_problem.trials(search_problem.torque(form, axis) for form in forms)
+    falls = [
+        float(trial.fallen.sum()) if trial is not None and is_strictly_possible(form, trial) else 0.0
+        for form, trial in zip(forms, trials, strict=True)
+    ]
+    return forms[int(np.argmax(falls))]
+
+
+def _around(gear: Elasticity | Backlash) -> list[Elasticity | Backlash]:
+    """Gears that are stiffer and softer than one, and have larger and smaller gaps where it has one."""
+    around: list[Elasticity | Backlash] = []
+    for factor in NEAR_FACTORS:
+        compliance = _rounded(gear.resonant_rad_nm * factor)
+        if isinstance(gear, Elasticity):
+            around.append(replace(gear, resonant_rad_nm=compliance))
             continue
-        fine: list[Tried] = []
-        for ratio in HELD_DAMPING if held else (FLANK_DAMPING,):
-            fine += _explained(search_problem, axis, *_around(best, ratio))
-        chosen += _beside(max(fine, key=lambda one: one.share), fine)
-    return tuple(chosen)
-
-
-def _around(best: Tried, damping_ratio: float) -> tuple[list[Elasticity | Backlash], list[int]]:
-    """Gaps as large as the best and its neighbours, with stiffer and softer flanks, and the place of each flank."""
-    size = HALF_GAPS_RAD.index(best.effect.settings["half_gap_rad"])
-    gears: list[Elasticity | Backlash] = []
-    places: list[int] = []
-    for place, factor in enumerate(FLANK_FACTORS):
-        compliance = _rounded(best.effect.resonant_rad_nm * factor)
-        for gap in HALF_GAPS_RAD[max(size - 1, 0) : size + 2]:
-            gears.append(
-                best.effect.with_settings(
-                    {"half_gap_rad": gap, "resonant_rad_nm": compliance, "damping_ratio": damping_ratio}
-                )
-            )
-            places.append(place)
-    return gears, places
-
-
-def _beside(best: Tried, tried: Sequence[Tried]) -> list[Effect]:
-    """The best gap, its neighbours in size, and those with a stiffer and a softer flank; all with its damping."""
-    size = HALF_GAPS_RAD.index(best.effect.settings["half_gap_rad"])
-    beside: list[Effect] = []
-    for one in tried:
-        if one.effect.damping_ratio != best.effect.damping_ratio:
-            continue
-        sizes_away = abs(HALF_GAPS_RAD.index(one.effect.settings["half_gap_rad"]) - size)
-        flanks_away = abs(one.frequency - best.frequency)
-        if sizes_away + flanks_away <= 1:
-            beside.append(one.effect)
-    return beside
+        for gap_factor in GAP_FACTORS:
+            gap = _rounded(gear.half_gap_rad * gap_factor)
+            around.append(replace(gear, resonant_rad_nm=compliance, half_gap_rad=gap))
+    return around
 
 
 def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
@@ -173,9 +151,7 @@ def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
     return tuple(float(f"{share * largest:.3g}") for share in ROTOR_SHARES)
 
 
-def _explained(
-    search_problem: SearchProblem, axis: int, gears: Sequence[Elasticity | Backlash], frequencies: Sequence[int]
-) -> list[Tried]:
+def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Elasticity | Backlash]) -> list[float]:
     """Share of the squared residual that gears explain on the joint itself; all have one damping, form and rotor."""
     first = gears[0]
     gaps = np.array([gear.settings.get("half_gap_rad", 0.0) for gear in gears])
@@ -187,8 +163,7 @@ def _explained(
         found = twists(link_of(signals, axis, held=bool(first.held)), several)
         return found.passed_nm - signals.gear_torque(axis)
 
-    shares = shares_explained(search_problem, _tried(search_problem, axis, behind))
-    return [Tried(*one) for one in zip(gears, frequencies, shares, strict=True)]
+    return [float(share) for share in shares_explained(search_problem, _tried(search_problem, axis, behind))]
 
 
 def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
