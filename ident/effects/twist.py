@@ -15,7 +15,7 @@ Spong (1987), "Modeling and control of elastic joint robots", with the encoder o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack
@@ -28,7 +28,7 @@ LEAST_SHARE = 0.02  #: Of the mean, below which an inertia is not one of a link
 LEAD_S = 0.03  #: Time before a turn of the torque from which the twist is computed: a flank may be left early
 SETTLED_S = 0.3  #: Time after the last turn until a flank is in touch again
 LONGEST_HOLD_S = 2.0  #: Time at rest after which a link is taken to stand where its weight pushes it
-TWIST_RAD = 1e-3  #: Largest twist of the derivative to a twist
+POSTURE_S = 0.01  #: Time between two postures in which the derivatives to position and velocity are computed
 STEP_RAD = 0.25  #: Largest step of the resonance of flank and link
 MOST_STEPS = 16  #: Of a sample
 
@@ -226,19 +226,22 @@ def torque_of_twist(signals: Signals, axis: int, twist_rad: FloatArray) -> Float
     Args:
         signals: of the run; without the arm behind them it is zero.
         axis: joint j.
-        twist_rad: δ, by which the joint lags its motor, of any size, shape (k,).
+        twist_rad: δ, by which the joint lags its motor, shape (k,).
     """
-    largest = float(np.max(np.abs(twist_rad), initial=0.0))
-    if signals.arm is None or not largest > 0.0:
+    if signals.arm is None:
         return np.zeros_like(signals.load_torque_nm)
-    small = twist_rad * (TWIST_RAD / largest)
-    motion = signals.arm.motion
-    position = motion.position_rad.copy()
-    position[:, axis] -= small
-    velocity = motion.velocity_rad_s.copy()
-    velocity[:, axis] -= np.gradient(small) * signals.rate_hz
-    twisted = replace(motion, position_rad=position, velocity_rad_s=velocity)
-    return np.asarray(signals.arm.load_change(twisted) * (largest / TWIST_RAD))
+    count = len(twist_rad)
+    every = max(1, round(POSTURE_S * signals.rate_hz))
+    postures = np.unique(np.append(np.arange(0, count, every), count - 1))
+    by_position, by_velocity = signals.arm.load_derivatives(axis, postures)
+    rate_rad_s = np.gradient(twist_rad) * signals.rate_hz
+    samples = np.arange(count)
+    added = np.empty_like(signals.load_torque_nm)
+    for joint in range(len(added)):
+        stiffness = np.interp(samples, postures, by_position[joint])
+        damping = np.interp(samples, postures, by_velocity[joint])
+        added[joint] = -stiffness * twist_rad - damping * rate_rad_s
+    return added
 
 
 def spring_torque(

@@ -156,7 +156,7 @@ def test_a_constant_twist_is_a_zero_that_is_off(run: Signals) -> None:
     expected = run.arm.load_change(replace(run.arm.motion, position_rad=position))
     found = torque_of_twist(run, AXIS, np.full(len(run.time_s), half_gap))
     assert np.abs(expected).max() > 1e-3
-    assert found == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+    assert found == pytest.approx(expected, abs=5e-3 * np.abs(expected).max())
 
 
 def test_without_friction_a_held_link_is_one_that_is_not(run: Signals) -> None:
