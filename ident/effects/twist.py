@@ -34,7 +34,7 @@ MOST_STEPS = 16  #: Of a sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
+class DrivenLink:
     """What moves a link behind a gear, shape (k,) each."""
 
     rate_hz: float  #: sampling rate
@@ -52,7 +52,7 @@ class Link:
         return np.asarray(np.where(is_moving, self.torque_nm + self.dry_nm * direction, self.torque_nm - held))
 
 
-def link_of(signals: Signals, axis: int, *, held: bool) -> Link:
+def link_of(signals: Signals, axis: int, *, held: bool) -> DrivenLink:
     """Return the link of a joint.
 
     Args:
@@ -64,15 +64,15 @@ def link_of(signals: Signals, axis: int, *, held: bool) -> Link:
     speed = signals.velocity_rad_s[axis]
     geared = signals.gear_torque(axis)
     if not held:
-        return Link(signals.rate_hz, inertia, geared, speed, np.zeros_like(geared))
+        return DrivenLink(signals.rate_hz, inertia, geared, speed, np.zeros_like(geared))
     load = signals.link_torque(axis)
     friction = np.abs(geared - load)
     is_moving = np.abs(speed) > STICKING_RAD_S
     if not np.any(is_moving):
-        return Link(signals.rate_hz, inertia, load, speed, np.zeros_like(load))
+        return DrivenLink(signals.rate_hz, inertia, load, speed, np.zeros_like(load))
     # At rest there is no friction in the prediction; in slow motion there is hardly any but the dry one.
     at_rest = float(np.min(friction[is_moving]))
-    return Link(signals.rate_hz, inertia, load, speed, np.where(is_moving, friction, at_rest))
+    return DrivenLink(signals.rate_hz, inertia, load, speed, np.where(is_moving, friction, at_rest))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +93,7 @@ class Twists:
     passed_nm: FloatArray  #: y
 
 
-def twists(link: Link, gears: Gears) -> Twists:
+def twists(link: DrivenLink, gears: Gears) -> Twists:
     """Follow a link behind each of several gears.
 
     Where the torque turns, and where friction holds the link, M δ̈ = τ_L + F − y is integrated by small steps, y zero in
@@ -136,7 +136,7 @@ class Windows:
     length: IntArray  #: samples of each, shape (w,)
 
 
-def _windows(link: Link, pushed_nm: FloatArray, *, has_gap: bool) -> Windows | None:
+def _windows(link: DrivenLink, pushed_nm: FloatArray, *, has_gap: bool) -> Windows | None:
     """Stretches in which the gear is more than a spring; None without any."""
     settle = round(SETTLED_S * link.rate_hz)
     lead = round(LEAD_S * link.rate_hz)
@@ -158,7 +158,7 @@ def _windows(link: Link, pushed_nm: FloatArray, *, has_gap: bool) -> Windows | N
     return Windows(begin[order], (end - begin)[order])
 
 
-def _short_holds(link: Link, longest: int) -> BoolArray:
+def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
     """Samples of the times at rest in which friction holds the link and that last at most so long, shape (k,)."""
     is_held = (np.abs(link.speed_rad_s) <= STICKING_RAD_S) & (link.dry_nm > 0.0)
     edges = np.flatnonzero(np.diff(is_held, prepend=False, append=False))
@@ -168,7 +168,7 @@ def _short_holds(link: Link, longest: int) -> BoolArray:
     return np.asarray(is_held)
 
 
-def _followed(link: Link, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows) -> Twists:
+def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows) -> Twists:
     """Integrate the link in the windows; around them it is known."""
     rate_hz = link.rate_hz
     # A flank too stiff for the steps is as good as one that they resolve.

@@ -18,7 +18,7 @@ from ident.discovery.resonance import propose_resonances
 from ident.effects.dictionary import EFFECTS
 from ident.effects.signals import fitted_signals
 from ident.effects.transmission import Backlash, Elasticity
-from ident.effects.twist import Gears, Link, spring_torque, twists
+from ident.effects.twist import DrivenLink, Gears, spring_torque, twists
 from ident.model.robot import Motion
 from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, training_error
 
@@ -127,7 +127,7 @@ def test_windows_hold_all_that_a_gap_does() -> None:
     inertia = 0.5 + 0.2 * np.sin(time)
     gaps, compliances = np.array([4e-4, 2e-3]), np.array([2e-4, 1e-4])
     still = np.zeros_like(torque)
-    link = Link(rate_hz, inertia, torque, still, still)
+    link = DrivenLink(rate_hz, inertia, torque, still, still)
     made = twists(link, Gears(gaps, compliances, RATIO)).acceleration_rad_s2
     for one, gap, compliance in zip(made, gaps, compliances, strict=True):
         whole = _stepped(torque, inertia, rate_hz, compliance, gap)[1][100:-100]

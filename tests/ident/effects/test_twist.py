@@ -14,7 +14,7 @@ from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence
 from ident.effects.signals import Signals
 from ident.effects.transmission import Backlash, Elasticity
-from ident.effects.twist import Gears, Link, link_of, torque_of_twist, twists
+from ident.effects.twist import DrivenLink, Gears, link_of, torque_of_twist, twists
 from ident.model.robot import Motion
 from tests.ident.recordings import search_problem_of
 
@@ -28,7 +28,7 @@ STEPS = 40  #: Of a sample, where every step is computed
 AXIS = 1
 
 
-def _back_and_forth(weight_nm: float) -> Link:
+def _back_and_forth(weight_nm: float) -> DrivenLink:
     """A motor that moves, rests for a while, and moves back; the link has a weight."""
     time_s = np.arange(2400) / RATE_HZ
     speed = np.zeros_like(time_s)
@@ -36,7 +36,7 @@ def _back_and_forth(weight_nm: float) -> Link:
         inside = (time_s >= begin_s) & (time_s < begin_s + 0.7)
         speed[inside] = direction * 0.8 * np.sin(np.pi * (time_s[inside] - begin_s) / 0.7) ** 2
     torque = weight_nm + INERTIA_KG_M2 * np.gradient(speed) * RATE_HZ
-    return Link(
+    return DrivenLink(
         RATE_HZ,
         np.full(len(time_s), INERTIA_KG_M2),
         torque,
@@ -45,7 +45,7 @@ def _back_and_forth(weight_nm: float) -> Link:
     )
 
 
-def _stepped(link: Link, gap_rad: float, compliance_rad_nm: float, twist_rad: float) -> NDArray[np.float64]:
+def _stepped(link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_rad: float) -> NDArray[np.float64]:
     """What the gear passes, step by step from the first sample to the last: two masses with friction, no windows."""
     damping = 2.0 * RATIO * np.sqrt(INERTIA_KG_M2 / compliance_rad_nm)
     step_s = 1.0 / (STEPS * link.rate_hz)
