@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -48,13 +48,14 @@ help:
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
 	@echo "make real-study  effects found on real robots, judged where the arm was elsewhere (docs/evidence/real.md); needs the recordings; resumable, half an hour"
 	@echo "make geometry-study  wrong zeros, tilted gravity and late signals on four robots: named, and the gains; resumable, hours"
-	@echo "make damage-study  held readings of a real arm, and a drive that gives less than its reference asks for; minutes"
+	@echo "make damage-study  held readings of a real arm, a drive that gives less than asked, faults of channels; half an hour"
 	@echo "make session-study  motion and errors of a guided session beside the way step by step (docs/evidence/session.md); resumable, hours"
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
 	@echo "make stopping-study  gains and their error bars where a recording ends as soon as every error bar is at its target (docs/evidence/stopping.md); resumable, ten minutes"
 	@echo "make warm-up-study  how far friction that falls while the arm warms up bends the gains, by the order of blocks; resumable, an hour"
 	@echo "make prior-study  full parameters under right and wrong priors: coverage, and what is noticed (docs/evidence/prior.md); resumable, twenty minutes"
 	@echo "make pairs-study  gains of independent recordings of one arm beside their error bars, after the search (docs/evidence/pairs.md); resumable, hours"
+	@echo "make planner-study  error bars that the planner predicts beside those of the fit, slow noise too (docs/evidence/planning.md); minutes"
 	@echo "make contact-study  false alarms an hour and height of the thresholds of contact (docs/evidence/contact.md); minutes"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
@@ -196,6 +197,9 @@ session-study: setup
 
 pairs-study: setup
 	$(BIN)/python -m tests.studies.pairs_study --tables docs/evidence/data
+
+planner-study: setup
+	$(BIN)/python -m tests.studies.planner_study --tables docs/evidence/data
 
 contact-study: setup
 	$(BIN)/python -m tests.studies.contact_study --tables docs/evidence/data

@@ -4,7 +4,8 @@ IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 │   ├── PayloadMissing    no run has a payload of known mass, which free gains need
-│   └── CurrentUnsigned   drives report the size of the current only
+│   ├── CurrentUnsigned   drives report the size of the current only
+│   └── ChannelUnfit      a channel shows by itself that it cannot be used: JointStill, CurrentConstant, ReadingsDamaged
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
@@ -117,6 +118,10 @@ class CurrentConstant(ChannelUnfit):
         )
 
 
+class ReadingsDamaged(ChannelUnfit):
+    """Readings of a channel are none, and nothing says what is right, or too many are (`ident.data.channel_faults`)."""
+
+
 class ModelContradicted(IdentificationError):
     """The declared model explains less of the data than it leaves."""
 
@@ -226,8 +231,8 @@ class Diagnosis:
     #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-clipped, current-late,
     #: current-limited, current-off-scale, current-reversed, estimators-disagree, gain-off-nameplate, gain-unseen,
     #: geometry-off, gravity-tilted, gravity-turned, ill-conditioned, joint-still, length-off, masses-contradict,
-    #: payload-differs, place-off, position-late, position-reversed, readings-held, time-skew, torque-above-limit,
-    #: zero-off, zero-turned.
+    #: payload-differs, place-off, position-late, position-reversed, readings-damaged, readings-frozen, readings-held,
+    #: time-skew, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -22,6 +22,7 @@ from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.channel_faults import find_faults
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
@@ -167,8 +168,9 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         CyclesLost: SYNC cycles are missing.
         ClockImplausible: the time stamps show another rate, or one of them is early or late.
         CurrentSaturated: a limit was active in more than a tenth of an axis's samples.
-        PositionImplausible: positions far outside the joint limits, or a step or a speed that no motor makes.
-        CurrentImplausible: a current is an outlier.
+        PositionImplausible: positions far outside the joint limits, a step or a speed that no motor makes, or readings
+            of a position that are none and that nothing mends (`ident.data.channel_faults`).
+        CurrentImplausible: likewise of a current, or it is an outlier.
         LogIncomplete: cell and log do not belong together.
         ident.CurrentUnsigned: drives report the size of the current only.
     """
@@ -190,8 +192,9 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         )
     checks = SampleChecks(log.path)
     checks.take(samples)
-    if (fault := checks.fault(rate_hz)) is not None:
-        raise fault
+    lost = checks.fault(rate_hz)
+    if lost is not None:
+        raise lost
     scale = scaling(cell, log.head.readback)
     position_rad = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
     limited = limit_active(cell, samples.statusword)
@@ -207,10 +210,12 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         )
     answered = answers(samples.missing, len(cell.axes))
     valid = answered & ~limited
-    check_limits(str(log.path), position_rad, cell, valid)
     current = samples.current_raw * scale.current_per_unit
     known = scale.joints_known(answered)
-    if (fault := motion_fault(str(log.path), cell, rate_hz, position_rad, current, known)) is not None:
+    faults = find_faults(position_rad, current, rate_hz, cell.ratio, known)
+    check_limits(str(log.path), position_rad, cell, valid)
+    fault = motion_fault(str(log.path), cell, rate_hz, position_rad, current, known, faults)
+    if fault is not None:
         raise fault
     run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
     converted = Run(

@@ -30,8 +30,9 @@ from daq.errors import ConfigurationInconsistent, TableUnfit
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
+from daq.log.column_faults import UsedRows, fault_remarks, require_mendable, sound_columns
 from daq.log.container import MAGIC
-from daq.log.conversion import check_limits, scaling, unwrapped
+from daq.log.conversion import SiScaling, check_limits, scaling, unwrapped
 from daq.log.csv_table import read_csv
 from daq.log.mat_table import read_mat
 from daq.log.mcap_bag import ZSTD_MAGIC
@@ -46,6 +47,7 @@ from daq.log.plausibility import (
     check_steps,
     check_velocity,
     in_si,
+    require_changing,
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
@@ -53,6 +55,7 @@ from daq.log.table import Reader, Table
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
+from ident.data.channel_faults import ChannelFault
 from ident.model.bodies import Payload
 
 FEWEST_ROWS = 3  #: Rows of a recording; fewer have neither a rate nor a motion
@@ -94,20 +97,105 @@ def import_recording(
     _check_cell(wanted, cell, description)
     files = _read_tables(wanted, data)
     check_sizes(wanted, cell, files)
+    recorded = _recorded(wanted, cell, files)
+    kept = recorded.kept
+    rate_hz = recorded.used.rate_hz
+    digests = {name: file.digest for name, file in files.items()}
+    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
+    started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
+    run = RunInfo(
+        run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
+        rate_hz=rate_hz,
+        payload=_payload(wanted, cell),
+        operator=wanted.operator,
+        software=software,
+        started_wall_ns=started_wall_ns,
+        started_monotonic_ns=started_wall_ns,
+        origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
+        timing=timing,
+    )
+    content = LogContent.of(cell, run, bundle(path), kept.readback)
+    # A crash of an import loses no sample, so no clock is needed to flush in time.
+    with LogWriter(out, content, kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        stamp_ns = (started_ns + np.rint(np.arange(len(kept.counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
+        silent = (0,) * len(cell.axes)
+        rows = zip(stamp_ns, kept.counts.tolist(), kept.current_raw.tolist(), strict=True)
+        for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
+            log.readings(_readings(slow, cycle, time_ns))
+            log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
+        log.conclude(valid=True)
+    remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks += fault_remarks(recorded.faults, recorded.used)
+    return Imported(log.statistics, timing, tuple(remarks))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converted:
+    """Columns of a file as a log has them, and as a fit reads them."""
+
+    counts: IntArray  #: positions of the motors, shape (k, n)
+    current_raw: IntArray  #: shape (k, n)
+    readback: Readback  #: with the unit of each
+    scale: SiScaling
+    joint_rad: FloatArray  #: positions of the joints [rad; m of a prismatic joint], shape (k, n)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedRecording:
+    """A recording that a robot can have made."""
+
+    used: UsedRows
+    clock: Clock | None  #: None without a time column
+    kept: Converted  #: what the log is to hold
+    faults: tuple[ChannelFault, ...]  #: readings that are none
+
+
+def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> JudgedRecording:
+    """Judge and convert what the files hold.
+
+    Raises:
+        TableUnfit, PositionImplausible: the files cannot be used.
+    """
     table = files[wanted.position.file]
+    currents = files[wanted.current.file]
     position = table.take(wanted.position.columns)
-    current = files[wanted.current.file].take(wanted.current.columns)
-    check_current(current, wanted, files[wanted.current.file])
+    current = currents.take(wanted.current.columns)
+    require_changing(position, current, wanted, currents)
     if wanted.position.unit is PositionUnit.COUNTS:
         check_counts(position, wanted, table)
     clock = None
     rate_hz = wanted.rate_hz
+    row = np.arange(len(position))
     if wanted.time is not None:
         numbers = np.hstack([file.values for file in files.values()])
         clock = clock_of(files[wanted.time.file], wanted.time, numbers)
         rate_hz = clock.timing.rate_hz
-        position = position[clock.row]
+        row = clock.row
     assert rate_hz is not None  # load_import requires one of the two
+    used = UsedRows(row, None if clock is None else clock.time_s, rate_hz, wanted, files, cell)
+    check_current(current, wanted, currents)
+    sound = sound_columns(position, current, used)
+    kept = _converted(wanted, cell, position[row], current, clock)
+    joint_rad = kept.joint_rad
+    check_limits(str(table.path), joint_rad, cell)
+    check_motion(str(table.path), joint_rad, cell)
+    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    require_mendable(sound.faults, used, displaced=True)
+    check_speed(str(table.path), joint_rad, rate_hz, cell)
+    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
+    current_a = kept.current_raw * kept.scale.current_per_unit
+    warn_of_unsigned(wanted.name, joint_rad, current_a, rate_hz, cell)
+    is_resampled = clock is not None and clock.timing.resampled
+    if sound.faults and is_resampled:
+        # Where rows stay as they are, a fit mends them; a spline would spread what is wrong.
+        kept = _converted(wanted, cell, sound.position[row], sound.current, clock)
+    return JudgedRecording(used, clock, kept, sound.faults)
+
+
+def _converted(
+    wanted: ImportDescription, cell: Cell, position: FloatArray, current: FloatArray, clock: Clock | None
+) -> Converted:
+    """Convert positions of the rows that are used, and currents of all rows."""
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
     raw, unit = quantise(on_clock(current, clock) * np.array(factors))
@@ -120,37 +208,7 @@ def import_recording(
     scale = scaling(cell, readback)
     # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
     joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
-    check_limits(str(table.path), joint_rad, cell)
-    check_motion(str(table.path), joint_rad, cell)
-    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
-    check_speed(str(table.path), joint_rad, rate_hz, cell)
-    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
-    warn_of_unsigned(wanted.name, joint_rad, raw * unit, rate_hz, cell)
-    digests = {name: file.digest for name, file in files.items()}
-    slow = _slow(wanted, cell, files, clock, rate_hz)
-    started_ns, started_wall_ns, timing = _start(wanted, files, clock)
-    run = RunInfo(
-        run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
-        rate_hz=rate_hz,
-        payload=_payload(wanted, cell),
-        operator=wanted.operator,
-        software=software,
-        started_wall_ns=started_wall_ns,
-        started_monotonic_ns=started_wall_ns,
-        origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
-        timing=timing,
-    )
-    content = LogContent.of(cell, run, bundle(path), readback)
-    # A crash of an import loses no sample, so no clock is needed to flush in time.
-    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
-        stamp_ns = (started_ns + np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
-        silent = (0,) * len(cell.axes)
-        rows = zip(stamp_ns, counts.tolist(), raw.tolist(), strict=True)
-        for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
-            log.readings(_readings(slow, cycle, time_ns))
-            log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
-        log.conclude(valid=True)
-    return Imported(log.statistics, timing, tuple(remark for file in files.values() for remark in file.remarks))
+    return Converted(counts, raw, readback, scale, joint_rad)
 
 
 def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:

@@ -1,11 +1,13 @@
 """Numbers that no robot moves by, in a recording of our own as in an import: one judgement for both.
 
-A glitch of an encoder is a step between two samples that no motor makes; a wrong scale makes every speed impossible; a
-damaged current is an outlier. Each function returns what it found, with the axis and the sample.
+Readings that are none are found by `ident.data.channel_faults`, without a description of the robot. With its limits, a
+step between two samples may be one that no motor makes, and a wrong scale makes every speed impossible; an outlier of
+the currents is none. Each function returns what it found, with the axis and the sample.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +15,8 @@ import numpy as np
 from daq.config.cell import Cell, CellAxis
 from daq.errors import CurrentImplausible, DataError, PositionImplausible
 from ident.arrays import BoolArray, FloatArray
+from ident.data.channel_faults import ChannelFault, ChannelKind, refused_fault
+from ident.data.fault_text import expected, found, remedy
 
 LARGEST_OUTLIER = 1000.0
 """Largest current, in multiples of the 99th percentile of its column; a real peak is some ten times that."""
@@ -171,7 +175,13 @@ _GLITCH = (
 
 
 def motion_fault(
-    name: str, cell: Cell, rate_hz: float, position_rad: FloatArray, current: FloatArray, answered: BoolArray
+    name: str,
+    cell: Cell,
+    rate_hz: float,
+    position_rad: FloatArray,
+    current: FloatArray,
+    answered: BoolArray,
+    faults: Sequence[ChannelFault],
 ) -> DataError | None:
     """Return the error for a recording of our own that no robot moves by, None for a plausible one.
 
@@ -182,22 +192,42 @@ def motion_fault(
         position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
         current: of the motors, shape (k, n).
         answered: whether every motor that moves the joint answered, shape (k, n).
+        faults: of its channels (`ident.data.channel_faults.find_faults`).
     """
+    damaged = refused_fault(faults, displaced=False)
+    if damaged is not None:
+        return fault_error(damaged, name, cell)
     known_rad = between_answers(position_rad, answered)
     step = impossible_step(known_rad, rate_hz, cell)
     if step is not None:
-        found = replace(step, found=f"{step.found}, at {step.row / rate_hz:.6g} s")
-        return found.error(PositionImplausible, _axis_of(step, name, cell), _GLITCH)
+        timed = replace(step, found=f"{step.found}, at {step.row / rate_hz:.6g} s")
+        return timed.error(PositionImplausible, _axis_of(step, name, cell), _GLITCH)
     speed = impossible_speed(known_rad, rate_hz, cell)
     if speed is not None:
-        remedy = "check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file"
-        return speed.error(PositionImplausible, _axis_of(speed, name, cell), remedy)
+        check = "check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file"
+        return speed.error(PositionImplausible, _axis_of(speed, name, cell), check)
+    displaced = refused_fault(faults, displaced=True)
+    if displaced is not None:
+        return fault_error(displaced, name, cell)
     outlier = impossible_current(current)
     if outlier is not None:
-        found = replace(outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s")
-        remedy = "record again, and check the object that the drive sends as its current"
-        return found.error(CurrentImplausible, _axis_of(outlier, name, cell), remedy)
+        timed = replace(outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s")
+        check = "record again, and check the object that the drive sends as its current"
+        return timed.error(CurrentImplausible, _axis_of(outlier, name, cell), check)
     return None
+
+
+def fault_error(fault: ChannelFault, name: str, cell: Cell) -> DataError:
+    """Return the error for readings that are none.
+
+    Args:
+        fault: of a channel, that nothing mends.
+        name: of the recording in the message.
+        cell: with the names of the axes.
+    """
+    kind = PositionImplausible if fault.quantity is ChannelKind.POSITION else CurrentImplausible
+    subject = f"{name}, axis {cell.axes[fault.axis].name}"
+    return kind(subject, found=found(fault), expected=expected(fault), remedy=remedy(fault))
 
 
 def _axis_of(found: Impossible, name: str, cell: Cell) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from daq.log.message import RawArray
 from daq.log.metadata import Readback, RunStatistics
 from daq.log.reader import LogHead, LogReader, SampleBlock, SampleChecks, joined
 from drivers.messages import Sample
+from ident.data.channel_faults import find_faults
 
 
 def motion_reason(
@@ -45,18 +47,45 @@ def motion_reason(
     scale = scaling(cell, readback)
     position_rad = scale.joint_position(continuous_counts(position_counts, readback))
     known = scale.joints_known(answers(missing, len(cell.axes)))
-    fault = motion_fault("", cell, rate_hz, position_rad, current_raw * scale.current_per_unit, known)
+    current = current_raw * scale.current_per_unit
+    faults = find_faults(position_rad, current, rate_hz, cell.ratio, known)
+    fault = motion_fault("", cell, rate_hz, position_rad, current, known, faults)
     if fault is None:
         return ""
     axis = fault.subject.removeprefix(", ")
     return f"{axis}: {fault.found}"
 
 
+OVERLAP = 200  #: Samples of a block that are judged with the next one, too: more than what a fault is compared with
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Samples:
+    """What is judged of some samples."""
+
+    position_counts: RawArray  #: shape (k, n)
+    current_raw: RawArray  #: shape (k, n)
+    missing: NDArray[np.uint32]  #: bit i for axis i without an answer, shape (k,)
+
+    def after(self, before: _Samples) -> _Samples:
+        """Return these samples behind others."""
+        return _Samples(
+            np.concatenate((before.position_counts, self.position_counts)),
+            np.concatenate((before.current_raw, self.current_raw)),
+            np.concatenate((before.missing, self.missing)),
+        )
+
+    def last(self, count: int) -> _Samples:
+        """Return so many of the last samples."""
+        return _Samples(self.position_counts[-count:], self.current_raw[-count:], self.missing[-count:])
+
+
 class MotionWatch:
-    """Finds block by block, in bounded memory, the logs of which all samples have to be judged: few have a fast step.
+    """Finds block by block, in bounded memory, the logs of which all samples have to be judged: few have a fault.
 
     What it does not suspect, `motion_fault` does not refuse: a speed over many samples has a step as fast among them,
-    and the 99th percentile of a current is at least the smallest one of the blocks.
+    the 99th percentile of a current is at least the smallest one of the blocks, a fault of a channel begins or ends in
+    one of them, and a current that lost its sign goes through most of its range in a step.
     """
 
     def __init__(self, cell: Cell, head: LogHead) -> None:
@@ -66,26 +95,38 @@ class MotionWatch:
         self._readback = head.readback
         self._scale = scaling(cell, head.readback)
         self._limits = np.array([axis.limits.velocity for axis in cell.axes])
-        self._last: RawArray | None = None
+        self._tail: _Samples | None = None
+        self._is_faulty = False
         self._fastest = 0.0  # in multiples of the velocity limit
         self._peak = np.zeros(len(cell.axes))
         self._usual = np.full(len(cell.axes), np.inf)
+        self._lowest = np.full(len(cell.axes), np.inf)
+        self._highest = np.full(len(cell.axes), -np.inf)
+        self._current_step = np.zeros(len(cell.axes))
 
     def take(self, block: SampleBlock) -> None:
         """Take the next samples."""
-        counts = block.position_counts
-        if counts.shape[1] != len(self._limits):
+        if block.position_counts.shape[1] != len(self._limits):
             return  # the reader refuses the log at its end
-        if self._last is not None:
-            counts = np.concatenate((self._last[None, :], counts))
-        self._last = counts[-1]
-        position_rad = self._scale.joint_position(continuous_counts(counts, self._readback))
+        samples = _Samples(block.position_counts, block.current_raw, block.missing)
+        if self._tail is not None:
+            samples = samples.after(self._tail)
+        self._tail = samples.last(OVERLAP)
+        position_rad = self._scale.joint_position(continuous_counts(samples.position_counts, self._readback))
         speeds = np.abs(np.diff(position_rad, axis=0)) * self._rate_hz / self._limits
         if speeds.size:
             self._fastest = max(self._fastest, float(speeds.max()))
         size = np.abs(block.current_raw.astype(np.float64))
         self._peak = np.maximum(self._peak, size.max(axis=0))
         self._usual = np.minimum(self._usual, np.percentile(size, 99.0, axis=0))
+        current = samples.current_raw.astype(np.float64)
+        self._lowest = np.minimum(self._lowest, current.min(axis=0))
+        self._highest = np.maximum(self._highest, current.max(axis=0))
+        steps = np.abs(np.diff(current, axis=0))
+        self._current_step = np.maximum(self._current_step, steps.max(axis=0, initial=0.0))
+        if not self._is_faulty:
+            known = self._scale.joints_known(answers(samples.missing, len(self._limits)))
+            self._is_faulty = bool(find_faults(position_rad, current, self._rate_hz, self._cell.ratio, known))
 
     def verdict(
         self, checks: SampleChecks, statistics: RunStatistics, again: Callable[[], Iterable[SampleBlock]]
@@ -99,7 +140,9 @@ class MotionWatch:
         """
         valid, reason = checks.verdict(self._rate_hz, statistics)
         outlier = self._peak > LARGEST_OUTLIER * self._usual
-        if not valid or not (self._fastest > SPEED_MARGIN or outlier.any()):
+        through = self._current_step > 0.5 * (self._highest - self._lowest)
+        is_suspected = self._is_faulty or self._fastest > SPEED_MARGIN or bool(np.any(outlier | through))
+        if not valid or not is_suspected:
             return valid, reason
         samples = joined(again())
         found = motion_reason(

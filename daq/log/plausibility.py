@@ -1,7 +1,8 @@
-"""Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column, a counter that wraps.
+"""Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column.
 
 Each check names the file, the column or axis, what was found, and the setting of the import description to correct. A
-step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`).
+step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`), and so are readings that are
+none (`daq.log.column_faults`).
 """
 
 from __future__ import annotations
@@ -39,8 +40,6 @@ SLOW_SHARE = 0.1
 LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
 TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
-COUNTER_BITS = range(12, 32)  #: Counters whose wraps are found; those of 32 bits are followed
-COUNTER_SHARE = 0.75  #: Least share of its range that a counter which wraps was seen in
 STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
 
 
@@ -66,7 +65,7 @@ def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) 
 
 
 def check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -> None:
-    """Refuse counts that are no whole numbers of 32 bits, and those of a counter that wraps at fewer bits."""
+    """Refuse counts that are no whole numbers of 32 bits."""
     wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
     if wrong.size:
         row, column = wrong[0].tolist()
@@ -76,30 +75,6 @@ def check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -
             expected="a whole number of encoder counts of at most 31 bits",
             remedy="correct `unit` in the import description",
         )
-    for index, counts in enumerate(position.T):
-        steps = np.abs(np.diff(counts))
-        row = int(np.argmax(steps)) + 1
-        bits = _bits_of_counter(float(counts.min()), float(counts.max()), float(steps[row - 1]))
-        if bits is not None:
-            raise TableUnfit(
-                file.place(row, wanted.position.columns[index]),
-                found=f"a step of {steps[row - 1]:.0f} counts, and all counts within {bits} bits: a counter that wraps",
-                expected="counts that go on, or a counter of 32 bits",
-                remedy="export the position of all turns, or unwrap the column",
-            )
-
-
-def _bits_of_counter(least: float, largest: float, step: float) -> int | None:
-    """Return the bits of a counter that wraps, by its range and its largest step; None if it need not wrap.
-
-    No motor makes half of its counter's range in one sample.
-    """
-    for bits in COUNTER_BITS:
-        size = 2.0**bits
-        inside = (least >= 0.0 and largest < size) or (least >= -size / 2.0 and largest < size / 2.0)
-        if inside and largest - least >= COUNTER_SHARE * size and step > size / 2.0:
-            return bits
-    return None
 
 
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
@@ -146,16 +121,30 @@ def check_velocity(
         )
 
 
-def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -> None:
-    """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
+def require_changing(position: FloatArray, current: FloatArray, wanted: ImportDescription, file: Table) -> None:
+    """Refuse a current of one value, unless the position of its axis does not change either.
+
+    Args:
+        position, current: as their files have them, shape (rows, n).
+        wanted: with the columns of the currents.
+        file: the file that they are in.
+
+    Raises:
+        TableUnfit: a current has one value while its axis moves.
+    """
     for index, column in enumerate(wanted.current.columns):
-        if len(current) > 1 and not np.ptp(current[:, index]):
+        is_constant = len(current) > 1 and not np.ptp(current[:, index])
+        if is_constant and np.ptp(position[:, index]):
             raise TableUnfit(
                 f"{file.path}, column {column}",
                 found=f"{current[0, index]:g} in every row" if current[0, index] else "zero in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
+
+
+def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -> None:
+    """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
     found = impossible_current(current)
     if found is not None:
         place = file.place(found.row, wanted.current.columns[found.axis])

@@ -27,7 +27,13 @@ from ident.calibration import AcceptedEffect, Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.data.run_channels import channels_of, clip_diagnoses, require_live_currents, still_diagnoses
+from ident.data.run_channels import (
+    channels_of,
+    clip_diagnoses,
+    fault_diagnoses,
+    require_usable_channels,
+    still_diagnoses,
+)
 from ident.effects.dictionary import GEOMETRY as CORRECTION_FAMILIES
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import TemperatureFriction
@@ -512,6 +518,7 @@ def diagnose_run(
 
     Raises:
         CurrentConstant: a motor moves, and its current has one value.
+        ReadingsDamaged: readings are none, and nothing mends them.
     """
     if any(one.name in GEOMETRY for one in calibration.diagnoses):
         return ()  # it predicts in a wrong geometry
@@ -529,8 +536,9 @@ def diagnose_run(
     idle = idle_joints(model, size, left)
     used = use & ~idle[:, None]
     channels = (channels_of(model, data),)
-    require_live_currents(channels[0], axes)
-    of_channels = (*still_diagnoses(channels, axes), *clip_diagnoses(channels, axes))
+    require_usable_channels(channels[0], axes)
+    damaged = tuple(fault_diagnoses(channels, axes))
+    of_channels = (*still_diagnoses(channels, axes), *damaged, *clip_diagnoses(channels, axes))
     found = list(scale_diagnoses(validation.measured_nm, validation.predicted_nm, used, axes, runs))
     if run.payload is not None and not found:
         found += _payload_diagnoses(calibration, run.payload, standard)

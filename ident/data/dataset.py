@@ -8,6 +8,14 @@ from functools import partial
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
+from ident.data.channel_faults import (
+    ChannelFault,
+    ChannelKind,
+    faults_in_use,
+    find_faults,
+    left_out_samples,
+    replaced_samples,
+)
 from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.held import HeldChannels, fill_held
@@ -21,6 +29,9 @@ STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the 95 % quantile of the joint's speed."""
 STANDSTILL_SIGMAS = 6.0
 """Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
+
+SETTLED_PERIODS = 4.0
+"""Periods of the position low-pass after which its response to a wrong position is over: 1e-4 of it is left."""
 
 LONGEST_MOVE_S = 2.0
 """Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a second)."""
@@ -52,6 +63,8 @@ class Dataset:
     #: clipping was not looked for.
     clipped: BoolArray | None = None
     held: HeldChannels | None = None  #: channels whose held readings were filled in; None where none was held
+    #: What is wrong with samples that count; glitches were filled in, what is frozen is not valid.
+    faults: tuple[ChannelFault, ...] = ()
     is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
 
     def motion(self, part: slice = slice(None)) -> Motion:
@@ -86,13 +99,22 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
     recorded_current = current
-    position, current, held = fill_held(position, current, rate)
+    faults = find_faults(position, current, rate, drive_train.ratio)
+    position, current, held = fill_held(
+        position,
+        current,
+        rate,
+        replaced_samples(faults, ChannelKind.POSITION, shape, drive_train.ratio),
+        replaced_samples(faults, ChannelKind.CURRENT, shape),
+    )
     raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
     position, velocity, acceleration = central_differences(smooth, rate)
     speed = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))
     moving, motor_moving = moving_samples(velocity, speed, drive_train)
     valid = np.ones_like(moving).T if usable is None else np.array(usable[1:-1], dtype=np.bool_, order="F")
+    margin = round(SETTLED_PERIODS * rate / conditioning.position_cutoff_hz)
+    valid &= ~left_out_samples(faults, shape, margin)[1:-1]
     clipped = clipped_samples(recorded_current[1:-1], valid & motor_moving.T)
     valid &= ~clipped
     # If the log has no moves, a new one begins after every standstill of all joints.
@@ -119,6 +141,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
         clipped=clipped,
         held=held,
+        faults=faults if usable is None else faults_in_use(faults, usable != 0.0),
     )
 
 

@@ -24,6 +24,7 @@ a twentieth of its readings by chance. A controller whose cycles are not even re
 a joint that two motors turn repeats what either of them does: 15 % on a real arm, which loses nothing by it."""
 JUMP_COUNTS = 3.0  #: Smallest jump after a held reading, in counts of the channel
 ROUNDING = 1e-9  #: Of a channel's range: smaller changes are rounding, no counts
+BESIDE = 4  #: Readings on either side by which a damaged one is filled in; as many as it has samples, if these are more
 LONGEST_HOLD_S = 0.05  #: A reading that stays longer may be a joint at rest
 
 
@@ -47,21 +48,36 @@ class Channel:
 
 
 def fill_held(
-    position: FloatArray, current: FloatArray, rate_hz: float
+    position: FloatArray,
+    current: FloatArray,
+    rate_hz: float,
+    damaged_position: BoolArray | None = None,
+    damaged_current: BoolArray | None = None,
 ) -> tuple[FloatArray, FloatArray, HeldChannels | None]:
-    """Fill in the held samples of a run's channels.
+    """Fill in the held samples of a run's channels, and the damaged ones.
 
     Args:
         position: of the joints, shape (k, n).
         current: of the motors, shape (k, n).
         rate_hz: sampling rate.
+        damaged_position, damaged_current: samples that are no readings, shape (k, n) each; None for none.
 
     Returns:
-        position and current, the same arrays where no channel holds its readings, and what was held, or None.
+        position and current, the same arrays where nothing was filled in, and what was held, or None.
     """
-    positions = [without_held(channel, rate_hz, smooth=True) for channel in position.T]
-    currents = [without_held(channel, rate_hz, smooth=False) for channel in current.T]
-    if not any(channel.share for channel in (*positions, *currents)):
+    none = np.zeros(position.shape, dtype=np.bool_)
+    damaged_position = none if damaged_position is None else damaged_position
+    damaged_current = none if damaged_current is None else damaged_current
+    positions = [
+        without_held(channel, rate_hz, smooth=True, damaged=damaged)
+        for channel, damaged in zip(position.T, damaged_position.T, strict=True)
+    ]
+    currents = [
+        without_held(channel, rate_hz, smooth=False, damaged=damaged)
+        for channel, damaged in zip(current.T, damaged_current.T, strict=True)
+    ]
+    is_held = any(channel.share for channel in (*positions, *currents))
+    if not is_held and not np.any(damaged_position) and not np.any(damaged_current):
         return position, current, None
     held = HeldChannels(
         position_share=np.array([channel.share for channel in positions]),
@@ -71,23 +87,38 @@ def fill_held(
     )
     filled_position = np.stack([channel.values for channel in positions], axis=1)
     filled_current = np.stack([channel.values for channel in currents], axis=1)
-    return filled_position, filled_current, held
+    return filled_position, filled_current, held if is_held else None
 
 
-def without_held(values: FloatArray, rate_hz: float, *, smooth: bool) -> Channel:
-    """Fill in the held samples of a channel; it stays as it is where fewer than LEAST_HELD are held.
+def held_channel(values: FloatArray, rate_hz: float) -> BoolArray | None:
+    """Return which samples of a channel are held, shape (k,); None where fewer than LEAST_HELD are.
+
+    Args:
+        values: of the channel, shape (k,).
+        rate_hz: sampling rate.
+    """
+    held = held_samples(values, rate_hz)
+    return held if _share_held(values, held) >= LEAST_HELD else None
+
+
+def without_held(values: FloatArray, rate_hz: float, *, smooth: bool, damaged: BoolArray | None = None) -> Channel:
+    """Fill in the held samples of a channel, unless fewer than LEAST_HELD are held, and the damaged ones.
 
     Args:
         values: of the channel, shape (k,).
         rate_hz: sampling rate.
         smooth: by a cubic spline, else by straight lines.
+        damaged: samples that are no readings, shape (k,); None for none.
     """
-    held = held_samples(values, rate_hz)
+    if damaged is None:
+        damaged = np.zeros(len(values), dtype=np.bool_)
+    held = held_channel(values, rate_hz)
+    if held is None:
+        return Channel(fill_damaged(values, damaged, longest_smooth(rate_hz) if smooth else 0))
     share = _share_held(values, held)
-    if share < LEAST_HELD:
-        return Channel(values)
     sample = np.arange(len(values))
-    read = ~held
+    read = ~held & ~damaged
+    held = ~read
     if smooth:
         filled = scipy.interpolate.CubicSpline(sample[read], values[read])(sample[held])
     else:
@@ -97,6 +128,43 @@ def without_held(values: FloatArray, rate_hz: float, *, smooth: bool) -> Channel
     lengths = np.diff(np.flatnonzero(read))
     hold_s = float(np.median(lengths[lengths > 1])) / rate_hz
     return Channel(out, share, hold_s)
+
+
+def longest_smooth(rate_hz: float) -> int:
+    """Most samples that a curve is laid through: beyond LONGEST_HOLD_S it would be made up."""
+    return max(BESIDE, round(LONGEST_HOLD_S * rate_hz))
+
+
+def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int, time: FloatArray | None = None) -> FloatArray:
+    """Fill in samples that are no readings, by those around them; the same array without any.
+
+    Args:
+        values: of a channel, shape (k,).
+        damaged: shape (k,).
+        longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on either side best,
+            others by a straight line.
+        time: of each sample, in any unit, shape (k,); None for a constant rate.
+    """
+    if not np.any(damaged) or np.all(damaged):
+        return values
+    out = values.copy()
+    right = np.flatnonzero(~damaged)
+    wrong = np.flatnonzero(damaged)
+    at = np.arange(len(values), dtype=np.float64) if time is None else time
+    out[wrong] = np.interp(at[wrong], at[right], values[right])
+    for block in np.split(wrong, np.flatnonzero(np.diff(wrong) > 1) + 1):
+        if len(block) > longest:
+            continue
+        wide = max(BESIDE, len(block))
+        place = int(np.searchsorted(right, block[0]))
+        near = right[max(place - wide, 0) : place + wide]
+        is_between = near[0] < block[0] and near[-1] > block[-1]
+        # Beyond the first and the last reading a cubic goes astray.
+        degree = 3 if is_between and len(near) > BESIDE else 1
+        middle = float(np.mean(at[near]))
+        fitted = np.polyfit(at[near] - middle, values[near], degree)
+        out[block] = np.polyval(fitted, at[block] - middle)
+    return out
 
 
 def held_samples(values: FloatArray, rate_hz: float) -> BoolArray:

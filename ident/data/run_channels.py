@@ -1,4 +1,4 @@
-"""Faults of single channels of a run: a joint that never moves, a current that is constant or clipped, held readings.
+"""Faults of single channels of a run: a joint that never moves, a current that is constant, readings that are none.
 
 Each is plain in the channel itself. In the equations of a fit it looks like something else, such as a payload that was
 not mounted, so it is named from the channels before a cause is looked for there.
@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
+from ident.data.channel_faults import ChannelFault
 from ident.data.dataset import Dataset
+from ident.data.fault_text import fault_diagnosis, require_usable
 from ident.data.held import HeldChannels
 from ident.errors import CurrentConstant, Diagnosis, JointStill
 from ident.model.robot import JointKind
@@ -39,6 +41,7 @@ class RunChannels:
     #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
     clipped_percent: FloatArray
     held: HeldChannels | None  #: readings that were held; None where none was
+    faults: tuple[ChannelFault, ...]  #: readings that are none (`ident.data.channel_faults`)
     #: Share of the samples of each moving motor in which its drive gave less than the reference, shape (m,).
     limited_percent: FloatArray
     torque_limits: FloatArray  #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
@@ -72,18 +75,21 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
         constant_current=is_constant,
         clipped_percent=percent,
         held=data.held,
+        faults=data.faults,
         limited_percent=np.zeros(len(kinds)),
         torque_limits=np.full(len(kinds), np.nan),
         limits=limits,
     )
 
 
-def require_live_currents(run: RunChannels, axes: Sequence[str]) -> None:
-    """Refuse a run in which a motor moves and its current has one value.
+def require_usable_channels(run: RunChannels, axes: Sequence[str]) -> None:
+    """Refuse a run of which a channel cannot be used.
 
     Raises:
-        CurrentConstant: it has.
+        ReadingsDamaged: readings are none, and nothing mends them.
+        CurrentConstant: a motor moves, and its current has one value.
     """
+    require_usable(run.run, run.faults, axes)
     dead = np.flatnonzero(run.constant_current).tolist()
     if dead:
         raise CurrentConstant(run.run, tuple(axes[axis] for axis in dead), float(run.limits[dead[0]]))
@@ -122,6 +128,13 @@ def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
         "record slower moves or with a lighter payload, or raise the limit of the current in the drive or in what "
         "recorded it",
     )
+
+
+def fault_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
+    """Name readings that are none; they were filled in, or left out."""
+    for run in runs:
+        for fault in run.faults:
+            yield fault_diagnosis(run.run, fault, axes[fault.axis])
 
 
 def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:

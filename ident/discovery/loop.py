@@ -42,7 +42,7 @@ from ident.discovery.joining import (
     refuted_by_structure,
 )
 from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
-from ident.discovery.resonance import propose_resonances
+from ident.discovery.resonance import propose_resonances, refined_gear
 from ident.discovery.ripple import propose_orders
 from ident.discovery.rotor_search import propose_rotors
 from ident.discovery.search import (
@@ -450,7 +450,7 @@ def _turn(
         if accepted is None or known >= most:
             break
         near = (*proposed.get(accepted.axis, ()), *families)
-        effect = refine_setting(problem, accepted.effect, accepted.axis, near)
+        effect = refined_gear(problem, refine_setting(problem, accepted.effect, accepted.axis, near), accepted.axis)
         chosen, accepted = accepted, replace(accepted, effect=effect)
         refuted = refuted_by_structure(model, accepted, aside)
         progress(f"adding {effect.name} on {names[accepted.axis]}")

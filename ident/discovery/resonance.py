@@ -6,20 +6,29 @@ and this chapter gives each axis the compliances that put the resonance of its m
 these are many, they are tried on the joint itself first, and proposed only where one of them explains half of what the
 gates require. For backlash, pairs of gap and compliance are tried where the residual gathers at turns of the torque,
 and the neighbours of the best pair are proposed.
+
+What was chosen gets its form and its finer settings in `refined_gear`: the link's friction acts as the motor moves, or
+holds the link by itself until the gear pushes it (`ident.effects.twist`). Where the mass matrix of an axis contains the
+rotor, which does not move behind the gear, some shares of it are tried as the rotor's inertia.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
 from ident.discovery.gates import Gates
+from ident.discovery.refinement import is_strictly_possible
+from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
 from ident.effects.effect import Effect
+from ident.effects.rotor import beside_rotor
 from ident.effects.signals import Signals, curvature
-from ident.effects.transmission import SETTLED_S, Backlash, Elasticity, spring_torque, twist_acceleration
+from ident.effects.transmission import Backlash, Elasticity
+from ident.effects.twist import SETTLED_S, Gears, link_of, spring_torque, twists
 from ident.equations.rows import decimate_rows
 
 Families = tuple[tuple[Effect, ...], ...]
@@ -30,6 +39,10 @@ DAMPING_RATIOS = (0.1, 0.25)
 HALF_GAPS_RAD = (2e-4, 3.2e-4, 5e-4, 8e-4, 1.3e-3, 2e-3, 3.2e-3, 5e-3, 8e-3)
 FLANKS_HZ = (15.0, 25.0, 40.0)
 FLANK_DAMPING = 0.2
+HELD_DAMPING = (0.1, 0.25, 0.5)
+NEAR_FACTORS = (0.5, 0.62, 0.79, 1.0, 1.27, 1.6, 2.0)  #: Of the compliance that was chosen
+GAP_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)  #: Of the gap that was chosen
+ROTOR_SHARES = (0.0, 0.25, 0.5, 0.75)  #: Of the largest inertia that the rotor of an axis can have
 SCREENED = 0.5  #: Share of the gates' least share below which nothing is proposed
 
 
@@ -58,36 +71,99 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
         own = run.inertia(axis, axis)
         torque = run.link_torque(axis)
         passed = [spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1]) for one in compliances[::2]]
-        return np.stack([curvature(one, run.rate_hz) for one in passed])
+        return -own * np.stack([curvature(one, run.rate_hz) for one in passed])
 
     if max(shares_explained(search_problem, _tried(search_problem, axis, bent))) < least:
         return ()
-    return (Elasticity(), *(Elasticity(one, ratio) for ratio in DAMPING_RATIOS for one in compliances))
+    plain = [Elasticity(one, ratio) for ratio in DAMPING_RATIOS for one in compliances]
+    return (Elasticity(), *plain)
 
 
 def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: float) -> tuple[Effect, ...]:
     if _gathered_at_turns(search_problem, axis) < least:
         return ()
     pairs = [(gap, one) for one in _compliances(inertia, FLANKS_HZ) for gap in HALF_GAPS_RAD]
-    gaps, compliances = (np.array(values) for values in zip(*pairs, strict=True))
-
-    def bent(run: Signals) -> FloatArray:
-        own = run.inertia(axis, axis)
-        torque = run.gear_torque(axis)
-        return twist_acceleration(torque, own, run.rate_hz, gaps, compliances, FLANK_DAMPING)
-
-    shares = shares_explained(search_problem, _tried(search_problem, axis, bent))
+    gears = [Backlash(0.0, gap, one, FLANK_DAMPING) for gap, one in pairs]
+    shares = _explained(search_problem, axis, gears)
     best = int(np.argmax(shares))
     if shares[best] < least:
         return ()
     flank, place = divmod(best, len(HALF_GAPS_RAD))
     near = [(flank, place + step) for step in (-1, 0, 1)] + [(flank + step, place) for step in (-1, 1)]
-    chosen = [
-        pairs[len(HALF_GAPS_RAD) * row + column]
+    return tuple(
+        gears[len(HALF_GAPS_RAD) * row + column]
         for row, column in near
         if 0 <= row < len(FLANKS_HZ) and 0 <= column < len(HALF_GAPS_RAD)
+    )
+
+
+def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
+    """Return a gear that is not rigid in the form, and with the settings, that explain most; any other effect as it is.
+
+    Both forms are tried: a link whose friction acts as its motor moves, and one that its own friction holds.
+
+    Args:
+        search_problem: around the model without the effect.
+        effect: that was chosen.
+        axis: index of its joint.
+    """
+    if not isinstance(effect, Elasticity | Backlash) or not effect.resonant_rad_nm > 0.0:
+        return effect
+    forms: list[Effect] = [effect]
+    for held in (0, 1):
+        tried: list[Elasticity | Backlash] = []
+        shares: list[float] = []
+        for rotor in _rotors(search_problem, axis) if held else (0.0,):
+            for ratio in HELD_DAMPING if held else (effect.damping_ratio,):
+                form = replace(effect, held=held, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
+                gears = _around(form)
+                tried += gears
+                shares += _explained(search_problem, axis, gears)
+        forms.append(tried[int(np.argmax(shares))])
+    trials = search_problem.trials(search_problem.torque(form, axis) for form in forms)
+    falls = [
+        float(trial.fallen.sum()) if trial is not None and is_strictly_possible(form, trial) else 0.0
+        for form, trial in zip(forms, trials, strict=True)
     ]
-    return tuple(Backlash(0.0, gap, one, FLANK_DAMPING) for gap, one in chosen)
+    return forms[int(np.argmax(falls))]
+
+
+def _around(gear: Elasticity | Backlash) -> list[Elasticity | Backlash]:
+    """Gears that are stiffer and softer than one, and have larger and smaller gaps where it has one."""
+    around: list[Elasticity | Backlash] = []
+    for factor in NEAR_FACTORS:
+        compliance = _rounded(gear.resonant_rad_nm * factor)
+        if isinstance(gear, Elasticity):
+            around.append(replace(gear, resonant_rad_nm=compliance))
+            continue
+        for gap_factor in GAP_FACTORS:
+            gap = _rounded(gear.half_gap_rad * gap_factor)
+            around.append(replace(gear, resonant_rad_nm=compliance, half_gap_rad=gap))
+    return around
+
+
+def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
+    """Inertias to be tried for the rotor of an axis [kg m²]: none where it is no part of the mass matrix."""
+    is_known = search_problem.runs[0].rotor_inertia(axis) > 0.0
+    if is_known or axis not in axes_with_rotor_in_load(search_problem.observation):
+        return (0.0,)
+    largest = largest_inertia(search_problem, axis)
+    return tuple(float(f"{share * largest:.3g}") for share in ROTOR_SHARES)
+
+
+def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Elasticity | Backlash]) -> list[float]:
+    """Share of the squared residual that gears explain on the joint itself; all have one damping, form and rotor."""
+    first = gears[0]
+    gaps = np.array([gear.settings.get("half_gap_rad", 0.0) for gear in gears])
+    compliances = np.array([gear.resonant_rad_nm for gear in gears])
+    several = Gears(gaps, compliances, first.damping_ratio)
+
+    def behind(run: Signals) -> FloatArray:
+        signals = beside_rotor(run, axis, first.rotor_inertia_kg_m2)
+        found = twists(link_of(signals, axis, held=bool(first.held)), several)
+        return found.passed_nm - signals.gear_torque(axis)
+
+    return [float(share) for share in shares_explained(search_problem, _tried(search_problem, axis, behind))]
 
 
 def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
@@ -110,17 +186,20 @@ def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
 
 
 def _compliances(inertia_kg_m2: float, frequencies_hz: Sequence[float]) -> tuple[float, ...]:
-    return tuple(float(f"{1.0 / (inertia_kg_m2 * (2.0 * np.pi * hz) ** 2):.4g}") for hz in frequencies_hz)
+    return tuple(_rounded(1.0 / (inertia_kg_m2 * (2.0 * np.pi * hz) ** 2)) for hz in frequencies_hz)
+
+
+def _rounded(compliance_rad_nm: float) -> float:
+    return float(f"{compliance_rad_nm:.4g}")
 
 
 def _tried(
-    search_problem: SearchProblem, axis: int, bent: Callable[[Signals], FloatArray]
+    search_problem: SearchProblem, axis: int, added: Callable[[Signals], FloatArray]
 ) -> tuple[CandidateTrial | None, ...]:
-    """Test twists by their torque on the joint itself, −M_jj δ̈: a sixth of the work of all joints on a six-axis arm."""
+    """Test gears by their torque on the joint itself: a sixth of the work of all joints on a six-axis arm."""
     conditioning, runs = search_problem.observation.conditioning, search_problem.runs
     rows = [
-        decimate_rows(data, conditioning, -run.inertia(axis, axis) * bent(run))
-        for run, data in zip(runs, search_problem.datasets, strict=True)
+        decimate_rows(data, conditioning, added(run)) for run, data in zip(runs, search_problem.datasets, strict=True)
     ]
     columns = np.concatenate(rows, axis=-1)
     torque = np.zeros((search_problem.axes, *columns.shape))

@@ -98,3 +98,12 @@ def beside_rotors(signals: Signals, effects: Iterable[PlacedEffect]) -> Signals:
     """Return signals of a run that know the rotors which losses of the model show."""
     known = known_rotors(effects, len(signals.current_a))
     return replace(signals, rotor_inertia_kg_m2=known) if known else signals
+
+
+def beside_rotor(signals: Signals, axis: int, inertia_kg_m2: float) -> Signals:
+    """Return signals of a run that know the rotor of one axis; the same signals for an inertia of 0."""
+    if not inertia_kg_m2:
+        return signals
+    known = [signals.rotor_inertia(index) for index in range(len(signals.current_a))]
+    known[axis] = inertia_kg_m2
+    return replace(signals, rotor_inertia_kg_m2=tuple(known))

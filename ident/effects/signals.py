@@ -22,6 +22,7 @@ UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier one
 REFERENCE_C = 40.0
 """Temperature at which the declared friction holds beside a friction that depends on it; motors are rated at this
 ambient temperature (IEC 60034-1). The fit is the same for any; a fixed one keeps calibrations comparable."""
+TWIST_RAD, TWIST_RAD_S = 1e-4, 1e-3  #: Steps of the derivatives to the position and the velocity of a joint
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 
@@ -62,6 +63,29 @@ class Arm:
         if "load" not in self._kept:
             self._kept["load"] = self._load(self.motion)
         return self._load(motion) - self._kept["load"]
+
+    def load_derivatives(self, axis: int, samples: IntArray) -> tuple[FloatArray, FloatArray]:
+        """∂τ/∂q_j and ∂τ/∂q̇_j of the torque for links and payload at some samples, shape (m, s) each.
+
+        Args:
+            axis: joint j.
+            samples: at which they are computed, the same at every call.
+        """
+        names = (f"position {axis}", f"velocity {axis}")
+        if names[0] not in self._kept:
+            motion = Motion(
+                self.motion.position_rad[samples],
+                self.motion.velocity_rad_s[samples],
+                self.motion.acceleration_rad_s2[samples],
+            )
+            load = self._load(motion)
+            position = motion.position_rad.copy()
+            position[:, axis] += TWIST_RAD
+            velocity = motion.velocity_rad_s.copy()
+            velocity[:, axis] += TWIST_RAD_S
+            self._kept[names[0]] = (self._load(replace(motion, position_rad=position)) - load) / TWIST_RAD
+            self._kept[names[1]] = (self._load(replace(motion, velocity_rad_s=velocity)) - load) / TWIST_RAD_S
+        return self._kept[names[0]], self._kept[names[1]]
 
     def smooth_torque_change(self, motion: Motion) -> FloatArray:
         """Whole torque of another motion without dry friction, less that of this one [Nm or N], shape (m, k)."""

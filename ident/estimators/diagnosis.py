@@ -22,7 +22,13 @@ from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.data.run_channels import clip_diagnoses, held_diagnoses, limit_diagnoses, still_diagnoses
+from ident.data.run_channels import (
+    clip_diagnoses,
+    fault_diagnoses,
+    held_diagnoses,
+    limit_diagnoses,
+    still_diagnoses,
+)
 from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
 from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
@@ -110,6 +116,7 @@ def _diagnoses(
     estimate = judged_estimate(system, found.estimate)
     refuse_mistakes(system, estimate, axes, nameplate)
     diagnoses = [
+        *fault_diagnoses(found.channels, axes),
         *held_diagnoses(found.channels, axes),
         *clip_diagnoses(found.channels, axes),
         *limit_diagnoses(found.channels, axes),

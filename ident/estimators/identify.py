@@ -12,7 +12,7 @@ from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.data.run_channels import RunChannels, channels_of, require_live_currents
+from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
 from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
@@ -68,7 +68,7 @@ def identify(
         RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
         UnitsMistaken, CurrentReversed: with fixed gains.
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
-        CurrentConstant: see `ident.data.run_channels`.
+        CurrentConstant, ReadingsDamaged: see `ident.data.run_channels`.
         JointStill: a joint never moves in a run, and the fit has no usable number for that.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
@@ -185,10 +185,10 @@ def require_moved(standard: System, axes: Sequence[str]) -> None:
 def noting_channels(
     built: Iterable[tuple[Dataset, Iterable[Rows]]], model: Model, axes: Sequence[str], noted: list[RunChannels]
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
-    """Yield runs, and note the faults of their channels; refuse a current that is constant."""
+    """Yield runs, and note the faults of their channels; refuse those that cannot be used."""
     for data, pieces in built:
         channels = channels_of(model, data)
-        require_live_currents(channels, axes)
+        require_usable_channels(channels, axes)
         noted.append(channels)
         yield data, pieces
 

@@ -1,13 +1,19 @@
-"""What recorder and drive can do to a recording: held readings of a real arm, a drive that gives less than asked.
+"""What can happen to a recording: readings that are held, drives that give less than asked, faults of single channels.
 
-Run by `make damage-study`; minutes. The held readings need the TX-40's recording in ../shared/data or $DRIVEGAIN_DATA:
-each reading of its positions, its currents or both is held for a while, and the error of the whole arm is that of a fit
-with the nameplate gains. The drive is simulated: that of J4 gives 1.6 A at most where its reference asks for more.
+Run by `make damage-study`; half an hour. `--part held`, `limited`, `channels` or `sound` makes one part. The real
+recordings are in ../shared/data or $DRIVEGAIN_DATA, and what needs one that is not there is left out.
+
+held: each reading of the TX-40's positions, its currents or both is held for a while, and the error of the whole arm is
+that of a fit with the nameplate gains. limited: a simulated drive of J4 gives 1.6 A at most where its reference asks
+for more. channels: every fault of `planted_faults.py` by each way, as a table in out/damaged-recordings. sound: the
+judgement of a simulated run of every shipped robot and of the real ones, which have none of these faults.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +28,7 @@ from ident.estimators.diagnosis import diagnose
 from ident.estimators.identify import identify
 from tests.studies.effect_cells import EffectCase
 from tests.studies.effect_runs import CaseTask, load_runs, make_case
+from tests.studies.fault_table import judge_sound_recordings, write_fault_table
 from tests.studies.output import print_line
 from tests.studies.real_runs import Recording, data_folder, tx40
 from tests.studies.study_cells import world_cell
@@ -92,13 +99,30 @@ def limited_drive() -> None:
             print_line(f"  {one.text}")
 
 
-def main() -> int:
-    """Make the study and print its figures."""
+def held_readings_of_the_tx40() -> None:
+    """Print the errors of the TX-40 with readings that are held, if its recording is there."""
     if (data_folder() / "tx40").is_dir():
         held_readings(tx40(data_folder()))
     else:
         print_line(f"found no {data_folder() / 'tx40'}; the held readings are left out")
-    limited_drive()
+
+
+PARTS: dict[str, Callable[[], None]] = {
+    "held": held_readings_of_the_tx40,
+    "limited": limited_drive,
+    "channels": lambda: write_fault_table(OUT, WORLD, data_folder()),
+    "sound": lambda: judge_sound_recordings(data_folder()),
+}
+
+
+def main() -> int:
+    """Make the study and print its figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--part", choices=PARTS, help="one part alone")
+    options = parser.parse_args()
+    for name, make in PARTS.items():
+        if options.part in {None, name}:
+            make()
     return 0
 
 

@@ -103,7 +103,9 @@ class RecordingScore:
     effects: tuple[str, ...]
 
 
-def record_runs(cell: Cell, world: str, number: int) -> tuple[Run, ...]:
+def record_runs(
+    cell: Cell, world: str, number: int, effects: tuple[UndeclaredEffect, ...] = ARM_EFFECTS
+) -> tuple[Run, ...]:
     """Record the arm once: the truth is that of ARM_SEED, moves and noise are those of the recording's number."""
     arm = world_cell(ARM_SEED, world)
     runs = []
@@ -111,7 +113,7 @@ def record_runs(cell: Cell, world: str, number: int) -> tuple[Run, ...]:
         spec = spec_of(arm, payload, index)
         # One stream of seeds for all recordings: no two of their runs have the same noise.
         noise_seed = 10_000_000 + len(RUNS) * number + index
-        spec = replace(spec, effects=ARM_EFFECTS, seed=noise_seed)
+        spec = replace(spec, effects=effects, seed=noise_seed)
         moves_rng = np.random.default_rng([ARM_SEED, number, index])
         demand = point_to_point(cell, spec.start_rad, moves_rng, DURATION_S)
         declared = None if payload is None else declared_payload(payload)

@@ -28,6 +28,7 @@ from daq.log.importing import import_recording, quantise
 from daq.log.reader import read_log
 from daq.report.document import json_tree
 from daq.report.log import info_report
+from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -362,6 +363,48 @@ def test_a_step_of_an_axis_that_rests_is_refused_too(bench: Bench, capsys: pytes
     _refused(bench, capsys, 4, "column q3, axis J3", "in one sample", "the limit in the cell configuration")
 
 
+SMALL_GLITCH_DEG = 1.5
+"""No faster than the axis may move between two samples."""
+
+
+def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.joint_deg[120, 2] += SMALL_GLITCH_DEG
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "run.csv:122, column q3, axis J3: a position that leaves its course by up to 1." in said
+    run, cell = load_run(bench.out)
+    assert np.degrees(run.position_rad[120, 2]) == pytest.approx(bench.joint_deg[120, 2], abs=1e-4)
+    (fault,) = find_faults(run.position_rad, run.current_a, run.rate_hz, cell.ratio)
+    assert (fault.kind, fault.axis, fault.stretches.tolist()) == (FaultKind.GLITCH, 2, [[120, 121]])
+
+
+def test_a_glitch_of_a_current_among_resampled_rows_does_not_reach_the_log(bench: Bench) -> None:
+    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    assert bench.run() == 0
+    sound, _ = load_run(bench.out)
+    bench.out.unlink()
+    bench.current_a[200, 1] *= 100.0
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _with_time(bench, UNEVEN_MS)
+    assert bench.run() == 0
+    mended, _ = load_run(bench.out)
+    assert np.array_equal(mended.position_rad, sound.position_rad)
+    assert np.abs(mended.current_a - sound.current_a).max() < 0.1
+
+
+def test_an_axis_at_rest_may_have_no_current(bench: Bench) -> None:
+    """Its brake holds it, and its motor has no power."""
+    bench.joint_deg[:, 2] = 60.0
+    bench.current_a[:, 2] = 0.0
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    assert bench.run() == 0
+
+
 def test_a_step_is_found_in_resampled_samples_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.joint_deg[150:, 3] += np.degrees(0.5)
@@ -387,7 +430,7 @@ def test_a_counter_of_fewer_than_32_bits_that_wraps(
     counts[:, 0] = wrapped
     bench.write_csv(np.hstack((counts, bench.current_a)))
     bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
-    _refused(bench, capsys, 4, "column q1", f"within {bits} bits: a counter that wraps", "unwrap the column")
+    _refused(bench, capsys, 4, "column q1", f"a counter of {bits} bits that wraps", "unwrap the column")
 
 
 @pytest.mark.parametrize("rows", [1, 2])

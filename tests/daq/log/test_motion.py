@@ -1,4 +1,4 @@
-"""An encoder glitch in a log of our own is refused as in an import, wherever the log is read or called valid."""
+"""An encoder glitch in a log of our own is judged as in an import, wherever the log is read or called valid."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from daq.cli.app import main
+from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import save_calibration
 from daq.errors import CurrentImplausible, DataError, ExitCode, PositionImplausible
@@ -26,7 +28,10 @@ from daq.log.salvage import salvage
 from daq.report.log import info_report
 from drivers.messages import Sample
 from ident.arrays import FloatArray
+from ident.data.channel_faults import ChannelKind, FaultKind
 from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.run import Run
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, write
@@ -127,6 +132,73 @@ def test_every_verb_refuses_a_glitch(
     said = " ".join(capsys.readouterr().err.split())
     assert "a step of" in said
     assert "axis J2" in said
+
+
+SMALL_GLITCH_RAD = 0.002
+"""Of one sample: no faster than the motor may turn."""
+
+
+def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_path: Path) -> None:
+    joint_rad = _joints()
+    sound_run, cell = load_run(_log(tmp_path / "sound.mcap", _samples(joint_rad)))
+    joint_rad[1500:1503, 1] += SMALL_GLITCH_RAD
+    log = _log(tmp_path / "a.mcap", _samples(joint_rad))
+    run, _ = load_run(log)
+    sound = _differentiated(sound_run, cell)
+    data = _differentiated(run, cell)
+    (fault,) = data.faults
+    assert (fault.kind, fault.quantity, fault.axis) == (FaultKind.GLITCH, ChannelKind.POSITION, 1)
+    assert fault.stretches.tolist() == [[1500, 1503]]
+    assert fault.size == pytest.approx(SMALL_GLITCH_RAD * CELL.ratio[1, 1], rel=0.01)
+    assert sound.faults == ()
+    assert np.abs(data.position_rad - sound.position_rad).max() < 1e-4
+    assert info_report(log).valid
+
+
+def _differentiated(run: Run, cell: Cell) -> Dataset:
+    return differentiate(run, model_of(cell).drive_train, Conditioning(standstill_rad_s=(0.03,) * AXES))
+
+
+def _frozen(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[3500:4400, 1] = joint_rad[3500, 1]
+
+
+def _clipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[:, 1] = np.minimum(joint_rad[:, 1], np.percentile(joint_rad[:, 1], 80.0))
+
+
+def _without_sign(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    current[:, 1] = np.mod(current[:, 1], 2**16)
+
+
+def _slipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
+    joint_rad[1500:, 1] += 0.004
+
+
+FAULTS = {"frozen": _frozen, "clipped": _clipped, "without its sign": _without_sign, "slipped": _slipped}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: Path) -> None:
+    """None of these has a step that is too fast for the robot."""
+    joint_rad = _joints()
+    rows = _samples(joint_rad)
+    current = np.array([row.current_raw for row in rows])
+    FAULTS[kind](joint_rad, current)
+    moved = _samples(joint_rad)
+    rows = [replace(row, current_raw=tuple(own)) for row, own in zip(moved, current.tolist(), strict=True)]
+    log = _log(tmp_path / "a.mcap", rows)
+    with pytest.raises(DataError) as refused:
+        load_run(log)
+    assert refused.value.subject == f"{log}, axis J2"
+    described = info_report(log)
+    recorded = RecordedMotion(AXES)
+    for row in rows:
+        recorded.take(row)
+    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    reason = f"axis J2: {refused.value.found}"
+    assert (described.valid, described.reason) == (False, reason)
+    assert recorded.reason(CELL, readback, RATE_HZ) == reason
 
 
 def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path: Path) -> None:

@@ -165,6 +165,29 @@ def clipped(run: Run) -> Run:
     return replace(run, current_a=current)
 
 
+def glitched(run: Run) -> Run:
+    """A run in which the position of J2 is wrong in one sample."""
+    position = run.position_rad.copy()
+    position[1000, 1] += 0.5
+    return replace(run, position_rad=position)
+
+
+def frozen(run: Run) -> Run:
+    """A run in which the position of J2 stands still for a while although the joint moves."""
+    position = run.position_rad.copy()
+    speed = np.abs(np.diff(position[:, 1]))
+    start = 1000 + int(np.argmax(speed[1000:-1000]))
+    position[start : start + 200, 1] = position[start, 1]
+    return replace(run, position_rad=position)
+
+
+def displaced(run: Run) -> Run:
+    """A run in which the encoder of J2 loses its place."""
+    position = run.position_rad.copy()
+    position[2000:, 1] += 0.5
+    return replace(run, position_rad=position)
+
+
 def constant(run: Run) -> Run:
     """A run in which the channel of J2 has one value."""
     return replace(run, current_a=run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0]))
@@ -195,9 +218,12 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
     "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
     "J2 clipped": (in_one(3, clipped), "current-clipped r3 J2"),
+    "J2 wrong in a sample": (in_one(3, glitched), "readings-damaged r3 J2"),
+    "J2 displaced": (in_one(3, displaced), "ReadingsDamaged"),
     "J2 constant": (in_one(3, constant), "CurrentConstant"),
     "J3 still": (lambda runs: [still(run) if run.payload else run for run in runs], "JointStill"),
     "held out: J2 clipped": (in_one(7, clipped), "current-clipped r7 J2"),
+    "held out: J2 frozen": (in_one(7, frozen), "readings-frozen r7 J2"),
     "held out: J2 constant": (in_one(7, constant), "CurrentConstant"),
     "held out: J2 half as large": (
         in_one(7, lambda run: with_currents([run], np.array([1.0, 0.51, 1.0]))[0]),

@@ -17,7 +17,9 @@ from ident.discovery.loop import find_effects
 from ident.discovery.resonance import propose_resonances
 from ident.effects.dictionary import EFFECTS
 from ident.effects.signals import fitted_signals
-from ident.effects.transmission import Backlash, Elasticity, spring_torque, twist_acceleration
+from ident.effects.transmission import Backlash, Elasticity
+from ident.effects.twist import DrivenLink, Gears, spring_torque, twists
+from ident.model.robot import Motion
 from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, training_error
 
 FloatArray = NDArray[np.float64]
@@ -40,12 +42,17 @@ def quick(small_truth: Truth) -> Evidence:
 
 def _stepped(
     torque: FloatArray, inertia: FloatArray, rate_hz: float, compliance: float, half_gap: float = 0.0
-) -> FloatArray:
-    """Acceleration of the twist by small explicit steps from the first sample to the last, no windows."""
+) -> tuple[FloatArray, FloatArray]:
+    """Twist and its acceleration by small explicit steps from the first sample to the last, no windows."""
     steps = max(8, round(STEPS_HZ / rate_hz))
-    twist, rate, out = torque[0] * compliance + half_gap * np.sign(torque[0]), 0.0, np.zeros(len(torque))
+    twist = torque[0] * compliance + half_gap * np.sign(torque[0])
+    rate = 0.0
+    twists_rad = np.full(len(torque), twist)
+    bends = np.zeros(len(torque))
     for k in range(len(torque) - 1):
         damping = 2.0 * RATIO * np.sqrt(inertia[k] / compliance)
+        twists_rad[k] = twist
+        before = rate
         for part in range(steps):
             pulled = torque[k] + (torque[k + 1] - torque[k]) * part / steps
             if twist > half_gap:
@@ -56,21 +63,26 @@ def _stepped(
                 force = min(force, 0.0) if half_gap else force
             else:
                 force = 0.0
-            bend = (pulled - force) / inertia[k]
-            if part == 0:
-                out[k] = bend
-            rate += bend / (steps * rate_hz)
+            rate += (pulled - force) / inertia[k] / (steps * rate_hz)
             twist += rate / (steps * rate_hz)
-    out[-1] = out[-2]
-    return out
+        bends[k] = (rate - before) * rate_hz
+    twists_rad[-1] = twist
+    bends[-1] = bends[-2]
+    return twists_rad, bends
 
 
 def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: float) -> Evidence:
+    """Recordings of an arm whose joint stands behind its motor by the twist: torques of the arm where it is."""
+
     def torque(data: Dataset) -> FloatArray:
         run = fitted_signals(small.model, data, small.training, small.estimate)
-        inertia = run.inertia(slice(None), AXIS)
+        assert run.arm is not None
         through = (run.geared_torque_nm if half_gap else run.load_torque_nm)[AXIS]
-        return np.asarray(-inertia * _stepped(through, inertia[AXIS], run.rate_hz, compliance, half_gap))
+        twist, bend = _stepped(through, run.inertia(AXIS, AXIS), run.rate_hz, compliance, half_gap)
+        lag = np.stack((twist, np.gradient(twist) * run.rate_hz, bend))
+        states = np.stack((data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2))
+        states[:, :, AXIS] -= lag
+        return np.asarray(run.arm.load_change(Motion(*states)))
 
     return bent(small, truth, torque)
 
@@ -114,9 +126,11 @@ def test_windows_hold_all_that_a_gap_does() -> None:
     torque = 12.0 * np.sin(2.0 * np.pi * 0.7 * time) * np.cos(2.0 * np.pi * 0.16 * time) + 3.0
     inertia = 0.5 + 0.2 * np.sin(time)
     gaps, compliances = np.array([4e-4, 2e-3]), np.array([2e-4, 1e-4])
-    made = twist_acceleration(torque, inertia, rate_hz, gaps, compliances, RATIO)
+    still = np.zeros_like(torque)
+    link = DrivenLink(rate_hz, inertia, torque, still, still)
+    made = twists(link, Gears(gaps, compliances, RATIO)).acceleration_rad_s2
     for one, gap, compliance in zip(made, gaps, compliances, strict=True):
-        whole = _stepped(torque, inertia, rate_hz, compliance, gap)[100:-100]
+        whole = _stepped(torque, inertia, rate_hz, compliance, gap)[1][100:-100]
         left = one[100:-100] - whole
         assert np.sqrt(np.mean(left**2)) < 0.1 * np.sqrt(np.mean(whole**2))
 

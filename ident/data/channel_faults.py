@@ -1,0 +1,388 @@
+"""One judgement of the channels of a recording: what is wrong with single numbers, and whether it can be mended.
+
+Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A stretch in which a
+channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign,
+and an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which too
+much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
+sign `ident.data.unsigned_current`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.frozen import at_limit, frozen_current, frozen_position
+from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
+from ident.data.held import fill_damaged, held_channel, longest_smooth
+
+LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
+LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
+LOST_PLACE = 3.0
+"""Least step of a position after which it does not return, in multiples of its largest usual step."""
+USUAL_PERCENTILE = 99.0  #: Of the steps of a position
+MOTOR_UNIT, JOINT_UNIT = "rad of the motor", "rad or m of the joint"
+ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
+
+
+class ChannelKind(Enum):
+    """What a channel holds."""
+
+    POSITION = "position"
+    CURRENT = "current"
+
+
+class FaultKind(Enum):
+    """What is wrong with a channel."""
+
+    GLITCH = "glitch"
+    FROZEN = "frozen"
+    CLIPPED = "clipped"
+    WRAPPING = "wrapping"
+    UNSIGNED = "unsigned"
+    DISPLACED = "displaced"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelFault:
+    """Something wrong with one channel of a recording."""
+
+    kind: FaultKind
+    quantity: ChannelKind
+    axis: int  #: index
+    stretches: IntArray  #: first sample and end of each, shape (s, 2)
+    size: float  #: largest distance from the course, or the range of a counter, in the unit of the channel
+    samples: int  #: of the recording
+    rate_hz: float  #: of the recording
+    count: float = 0.0  #: smallest change of the channel
+    unit: str = ""  #: of the channel, for messages
+
+    @property
+    def share(self) -> float:
+        """Share of the samples of the recording."""
+        return float(np.sum(self.stretches[:, 1] - self.stretches[:, 0])) / self.samples
+
+    @property
+    def first(self) -> int:
+        """First sample of it."""
+        return int(self.stretches[0, 0])
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the recording cannot be used."""
+        if self.kind is FaultKind.GLITCH:
+            return self.share > LARGEST_GLITCHED
+        if self.is_left_out:
+            return self.share > LARGEST_FROZEN
+        return True
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether its samples are filled in."""
+        return self.kind is FaultKind.GLITCH
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether its samples are left out."""
+        return self.kind in {FaultKind.FROZEN, FaultKind.CLIPPED}
+
+
+def find_faults(
+    position: FloatArray,
+    current: FloatArray,
+    rate_hz: float,
+    ratio: FloatArray | None = None,
+    usable: BoolArray | None = None,
+    unit: str = MOTOR_UNIT,
+) -> tuple[ChannelFault, ...]:
+    """Judge the channels of a recording.
+
+    Args:
+        position: of the joints, or of whatever was recorded, shape (k, n).
+        current: of the motors, shape (k, n).
+        rate_hz: sampling rate.
+        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where each column was
+            recorded as it is.
+        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding. None for all.
+        unit: of the columns of positions, for messages.
+
+    Returns:
+        what is wrong, positions first, by axis.
+    """
+    if len(position) < 2:
+        return ()
+    found: list[ChannelFault] = []
+    read = position if ratio is None else motor_positions(position, ratio)
+    for axis, readings in enumerate(_readings(read, rate_hz)):
+        found += _position_faults(readings, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit))
+    if ratio is not None:
+        found = _with_joints(found, position, ratio, rate_hz)
+    for axis, readings in enumerate(_readings(current, rate_hz)):
+        found += _current_faults(readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position)))
+    return tuple(found) if usable is None else faults_in_use(found, usable)
+
+
+def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
+    """Return what is wrong with samples that count.
+
+    Args:
+        faults: of all samples.
+        usable: samples that count, shape (k, n).
+    """
+    found: list[ChannelFault] = []
+    for one in faults:
+        unused = np.cumsum(~usable[:, one.axis])
+        # A step is between two samples.
+        before = np.maximum(one.stretches[:, 0] - 2, 0)
+        is_in_use = unused[one.stretches[:, 1] - 1] == unused[before]
+        if np.any(is_in_use):
+            found.append(replace(one, stretches=one.stretches[is_in_use]))
+    return tuple(found)
+
+
+def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Return what the encoders of the motors have read, shape (k, n): a number that repeats repeats exactly.
+
+    Args:
+        position: of the joints, shape (k, n).
+        ratio: R of the drive train, shape (n, n).
+    """
+    motor_rad = np.empty_like(position)
+    for motor, row in enumerate(ratio):
+        joints = np.flatnonzero(row)
+        turned = position[:, joints] @ row[joints]
+        largest = float(np.max(np.abs(position[:, joints]) @ np.abs(row[joints])))
+        if len(joints) > 1 and largest > 0.0:
+            # The sum over joints has rounding errors, with which nothing would repeat.
+            turned = np.round(turned / largest, ROUNDED_DIGITS) * largest
+        motor_rad[:, motor] = turned
+    return motor_rad
+
+
+def _turned_by(ratio: FloatArray) -> BoolArray:
+    """Whether each motor turns each joint, joints first, shape (n, n)."""
+    size = np.abs(np.linalg.inv(ratio))
+    return np.asarray(size > 1e-12 * size.max(), dtype=np.bool_)
+
+
+def _with_joints(
+    motors: Sequence[ChannelFault], position: FloatArray, ratio: FloatArray, rate_hz: float
+) -> list[ChannelFault]:
+    """Add the faults of joints that several motors turn, whose own encoders may have been read.
+
+    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are in each of them.
+
+    Args:
+        motors: faults of the positions of the motors.
+        position: of the joints, shape (k, n).
+        ratio: R of the drive train, shape (n, n).
+        rate_hz: sampling rate.
+    """
+    found = list(motors)
+    turned_by = _turned_by(ratio)
+    coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
+    for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
+        own = [one for one in found if turned_by[joint, one.axis]]
+        if any(one.kind is not FaultKind.DISPLACED for one in own):
+            continue
+        faults = list(_position_faults(readings, ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)))
+        if any(one.is_left_out for one in faults):
+            found = [one for one in found if one not in own]
+        if any(one.is_left_out for one in faults) or not own:
+            found += faults
+    return found
+
+
+def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> ChannelFault | None:
+    """Return the first fault that nothing mends, None without one.
+
+    Args:
+        faults: of the recording.
+        displaced: look for positions that go on displaced, of which the limits of the robot may say more; else for
+            all others.
+    """
+    for one in faults:
+        if one.is_refused and (one.kind is FaultKind.DISPLACED) is displaced:
+            return one
+    return None
+
+
+def replaced_samples(
+    faults: Sequence[ChannelFault], quantity: ChannelKind, shape: tuple[int, ...], ratio: FloatArray | None = None
+) -> BoolArray:
+    """Samples of each column that are to be replaced by those around them, shape (k, n).
+
+    Currents that are left out stay as they are: nothing depends on them. Positions do not, because filters would spread
+    their steps.
+
+    Args:
+        faults: of the recording.
+        quantity: of the columns.
+        shape: of the columns.
+        ratio: R of the drive train, where the columns are joints, shape (n, n).
+    """
+    turned_by = None if ratio is None else _turned_by(ratio)
+    marked = np.zeros(shape, dtype=np.bool_)
+    for one in faults:
+        is_replaced = one.is_filled or (one.quantity is ChannelKind.POSITION and one.is_left_out)
+        if one.quantity is not quantity or not is_replaced:
+            continue
+        columns = np.array([one.axis])
+        if turned_by is not None:
+            columns = np.union1d(columns, np.flatnonzero(turned_by[:, one.axis]))
+        for first, end in one.stretches.tolist():
+            marked[first:end, columns] = True
+    return marked
+
+
+def mended(
+    values: FloatArray,
+    faults: Sequence[ChannelFault],
+    rate_hz: float,
+    ratio: FloatArray | None = None,
+    quantity: ChannelKind = ChannelKind.POSITION,
+    time: FloatArray | None = None,
+) -> FloatArray:
+    """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
+
+    Args:
+        values: positions or currents, as of `find_faults`.
+        faults: of the recording.
+        rate_hz: sampling rate.
+        ratio: as of `find_faults`, for positions.
+        quantity: of the values.
+        time: of each sample, in any unit, shape (k,); None for a constant rate.
+    """
+    replaced = replaced_samples(faults, quantity, values.shape, ratio)
+    if not np.any(replaced):
+        return values
+    longest = longest_smooth(rate_hz) if quantity is ChannelKind.POSITION else 0
+    columns = [fill_damaged(own, wrong, longest, time) for own, wrong in zip(values.T, replaced.T, strict=True)]
+    return np.stack(columns, axis=1)
+
+
+def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int) -> BoolArray:
+    """Samples of each axis that are to be left out, shape (k, n).
+
+    Every torque depends on every position. Around a position that is not known, filters spread what is assumed of it.
+
+    Args:
+        faults: of the recording.
+        shape: of its positions.
+        margin: samples before and after those of a position.
+    """
+    out = np.zeros(shape, dtype=np.bool_)
+    for one in faults:
+        if not one.is_left_out:
+            continue
+        for first, end in one.stretches.tolist():
+            if one.quantity is ChannelKind.POSITION:
+                out[max(first - margin, 0) : end + margin] = True
+            else:
+                out[first:end, one.axis] = True
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelPlace:
+    """A channel of a recording."""
+
+    quantity: ChannelKind
+    axis: int  #: index
+    samples: int  #: of the recording
+    unit: str = ""  #: of the channel, for messages
+
+    def fault(self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0) -> ChannelFault:
+        """Make a fault of this channel."""
+        return ChannelFault(
+            kind,
+            self.quantity,
+            self.axis,
+            stretches,
+            size,
+            self.samples,
+            readings.rate_hz,
+            readings.count,
+            self.unit,
+        )
+
+
+def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
+    """Yield the readings of each channel, shape (k, c), without those that were held.
+
+    A channel that hardly changes is taken to be as fine as the coarsest of the others.
+    """
+    counts = [smallest_change(values) for values in channels.T]
+    coarsest = max((count for count in counts if count is not None), default=0.0)
+    for values, count in zip(channels.T, counts, strict=True):
+        held = held_channel(values, rate_hz)
+        sample = np.arange(len(values)) if held is None else np.flatnonzero(~held)
+        yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
+
+
+def _position_faults(readings: Readings, place: ChannelPlace) -> Iterator[ChannelFault]:
+    jumps = find_jumps(readings, is_position=True)
+    whole = wrap_size(readings, jumps)
+    if whole is not None:
+        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
+        return
+    if jumps.glitches:
+        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
+    frozen = frozen_position(_without(readings, jumps))
+    if len(frozen):
+        kind = FaultKind.CLIPPED if at_limit(readings, frozen) else FaultKind.FROZEN
+        yield place.fault(kind, readings, frozen)
+    steps = np.abs(np.diff(readings.values))
+    usual = float(np.percentile(steps, USUAL_PERCENTILE)) if len(steps) else 0.0
+    lost = np.abs(jumps.step_size) > LOST_PLACE * usual
+    beside = np.isin(readings.sample[jumps.step] + 1, frozen) | np.isin(readings.sample[jumps.step + 1], frozen)
+    lost &= ~beside
+    if np.any(lost):
+        size = float(np.max(np.abs(jumps.step_size[lost])))
+        yield place.fault(FaultKind.DISPLACED, readings, _steps(readings, jumps.step[lost]), size)
+
+
+def _current_faults(readings: Readings, motor_rad: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+    upper = is_split(readings.values)
+    if upper is not None:
+        step = np.flatnonzero(np.diff(upper))
+        sizes = np.abs(np.diff(readings.values)[step])
+        yield place.fault(FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes)))
+        return
+    jumps = find_jumps(readings, is_position=False)
+    whole = wrap_size(readings, jumps)
+    if whole is not None:
+        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
+        return
+    if jumps.glitches:
+        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
+    frozen = frozen_current(_without(readings, jumps), motor_rad)
+    if len(frozen):
+        yield place.fault(FaultKind.FROZEN, readings, frozen)
+
+
+def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
+    after = np.append(readings.sample, readings.sample[-1] + 1)
+    return np.array([(after[one.first], after[one.end]) for one in jumps.glitches], dtype=np.int64)
+
+
+def _largest(jumps: Jumps) -> float:
+    return max(one.size for one in jumps.glitches)
+
+
+def _steps(readings: Readings, step: IntArray) -> IntArray:
+    """The sample after each step, as a stretch."""
+    after = readings.sample[step + 1]
+    return np.column_stack((after, after + 1))
+
+
+def _without(readings: Readings, jumps: Jumps) -> Readings:
+    """Readings without those that are glitches."""
+    is_right = np.ones(len(readings.values), dtype=np.bool_)
+    for one in jumps.glitches:
+        is_right[one.first : one.end] = False
+    return replace(readings, values=readings.values[is_right], sample=readings.sample[is_right])

@@ -1,0 +1,116 @@
+"""What a fault of a channel is, in words: found, expected, do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log2
+
+from ident.data.channel_faults import ChannelFault, ChannelKind, FaultKind
+from ident.errors import Diagnosis, ReadingsDamaged
+
+DAMAGED, FROZEN = "readings-damaged", "readings-frozen"  #: Names of diagnoses
+COUNTS = "counts"  #: Unit of a channel that has one a count
+NEAR_BITS = 0.02  #: Largest distance of the size of a counter from a power of two, in bits
+
+
+def require_usable(run: str, faults: Sequence[ChannelFault], axes: Sequence[str]) -> None:
+    """Refuse a recording with a fault of a channel that nothing mends.
+
+    Args:
+        run: its name.
+        faults: of the recording.
+        axes: name of each axis.
+
+    Raises:
+        ReadingsDamaged: for the first of them.
+    """
+    for fault in faults:
+        if fault.is_refused:
+            raise ReadingsDamaged(
+                run, (axes[fault.axis],), found=found(fault), expected=expected(fault), remedy=remedy(fault)
+            )
+
+
+def fault_diagnosis(run: str, fault: ChannelFault, axis: str) -> Diagnosis:
+    """Name a fault that was mended.
+
+    Args:
+        run: name of the recording.
+        fault: of it.
+        axis: name of the axis.
+    """
+    name = DAMAGED if fault.is_filled else FROZEN
+    return Diagnosis(name, (run,), (axis,), f"{found(fault)}; {what_is_done(fault)}", expected(fault), remedy(fault))
+
+
+def what_is_done(fault: ChannelFault) -> str:
+    """Say what is done with the samples of a fault."""
+    return "these samples were filled in" if fault.is_filled else "these samples were left out"
+
+
+def found(fault: ChannelFault) -> str:
+    """Say what a fault is, how often, and where it begins."""
+    at = f"at {fault.first / fault.rate_hz:.6g} s"
+    times = len(fault.stretches)
+    often = at if times == 1 else f"{times} times, first {at}"
+    what = f"a {fault.quantity.value}"
+    share = f"in {100.0 * fault.share:.2g} % of the samples"
+    match fault.kind:
+        case FaultKind.GLITCH:
+            longest_ms = 1e3 * max(end - first for first, end in fault.stretches.tolist()) / fault.rate_hz
+            return (
+                f"{what} that leaves its course by up to {_sized(fault)} and returns within {longest_ms:.3g} ms, "
+                f"{often}, {share}"
+            )
+        case FaultKind.FROZEN:
+            return f"{what} that keeps one number while its motor moves, {share}, {often}"
+        case FaultKind.CLIPPED:
+            return f"{what} that ends at one number while its motor moves on, {share}, {often}"
+        case FaultKind.WRAPPING:
+            return f"{what} that steps by {_sized(fault)} in one sample, {often}: a counter{_bits(fault)} that wraps"
+        case FaultKind.UNSIGNED:
+            return (
+                f"{what} of which one part is {_sized(fault)} above the other, with nothing between: negative numbers"
+                f"{_bits(fault)} that were read without their sign"
+            )
+        case FaultKind.DISPLACED:
+            return f"{what} that steps by {_sized(fault)} in one sample, and goes on displaced, {often}"
+
+
+def expected(fault: ChannelFault) -> str:
+    """Say what is expected in place of a fault."""
+    if fault.quantity is ChannelKind.CURRENT:
+        return "a current that follows the torque at every moment, with its sign"
+    return "a position that follows the motion at every moment"
+
+
+def remedy(fault: ChannelFault) -> str:
+    """Say what to do about a fault."""
+    is_position = fault.quantity is ChannelKind.POSITION
+    match fault.kind:
+        case FaultKind.WRAPPING if is_position:
+            return (
+                "record or export a counter of all turns (of 32 bits), or unwrap the column: nothing in it says in "
+                "which turn it began"
+            )
+        case FaultKind.WRAPPING | FaultKind.UNSIGNED:
+            return "read the object or the column as a signed number of enough bits, and record or import again"
+        case FaultKind.CLIPPED:
+            return "widen the range of what recorded it, or move within it; record again"
+        case _ if is_position:
+            return "check the encoder, its cable, and the object or column of the position; record again"
+        case _:
+            return "check the object or column of the current, and what sends it; record again"
+
+
+def _sized(fault: ChannelFault) -> str:
+    return f"{fault.size:.4g} {fault.unit}".strip()
+
+
+def _bits(fault: ChannelFault) -> str:
+    """Say how many bits a counter has, where its range is a power of two in counts; else nothing."""
+    count = 1.0 if fault.unit == COUNTS else fault.count
+    if not count > 0.0:
+        return ""
+    bits = log2(fault.size / count)
+    return f" of {round(bits)} bits" if abs(bits - round(bits)) < NEAR_BITS and bits > 7.0 else ""

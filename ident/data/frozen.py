@@ -1,0 +1,129 @@
+"""Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
+
+A joint that stops comes to rest over some samples, and starts from rest. A frozen position stands still from one sample
+to the next, or goes on with a jump. A frozen current lacks its noise while its motor moves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.glitches import Readings
+from ident.data.held import ROUNDING
+
+LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
+LEAST_CURRENT_S = 0.1  #: Likewise of a current
+ABRUPT = 3.0
+"""Way within BESIDE_S beside a stretch, in multiples of the largest usual change of it from one such time to the next:
+what a motor has on its way to a standstill is half of that."""
+USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
+ABRUPT_COUNTS = 10.0  #: And in counts
+BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
+LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
+NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
+MOVED = 0.02  #: Least way of a motor in a stretch in which its current should change, as a share of its range
+
+
+def frozen_position(readings: Readings) -> IntArray:
+    """Stretches in which a position is frozen, as first sample and end, shape (s, 2).
+
+    Args:
+        readings: of a motor's position.
+    """
+    tiny = ROUNDING * float(np.ptp(readings.values))
+    stretches = _constant(readings, tiny, LEAST_S)
+    samples = int(readings.sample[-1]) + 1
+    beside = max(LEAST_BESIDE, round(BESIDE_S * readings.rate_hz))
+    if not stretches or samples <= 4 * beside:
+        return _no_stretch()
+    # A held reading is on the way to the next one.
+    course = np.interp(np.arange(samples), readings.sample, readings.values)
+    way = np.abs(course[beside:] - course[:-beside])
+    changes = np.abs(course[2 * beside :] - 2.0 * course[beside:-beside] + course[: -2 * beside])
+    counts = way[beside:] > tiny
+    for first, last in stretches:
+        begin = int(readings.sample[first])
+        end = int(readings.sample[last])
+        counts[max(begin - 3 * beside, 0) : end + beside] = False
+    if not np.any(counts):
+        return _no_stretch()
+    usual = float(np.percentile(changes[counts], USUAL_PERCENTILE))
+    least = ABRUPT * usual + ABRUPT_COUNTS * readings.count
+    found: list[tuple[int, int]] = []
+    for first, last in stretches:
+        begin = int(readings.sample[first])
+        end = int(readings.sample[last])
+        before = way[begin - beside] if begin >= beside else 0.0
+        after = way[end] if end < len(way) else 0.0
+        if max(before, after) > least:
+            found.append((first, last))
+    return _samples(readings, found)
+
+
+def frozen_current(readings: Readings, motor_rad: FloatArray) -> IntArray:
+    """Stretches in which a current is frozen, as first sample and end, shape (s, 2).
+
+    Its largest and its smallest value are left to `ident.data.clipping`.
+
+    Args:
+        readings: of the current.
+        motor_rad: position of its motor at every sample, shape (k,).
+    """
+    values = readings.values
+    steps = np.diff(values)
+    changed = steps[steps != 0.0]
+    range_rad = float(np.ptp(motor_rad))
+    if len(changed) < 2 or not range_rad > 0.0:
+        return _no_stretch()
+    turns_back = float(np.mean(changed[1:] * changed[:-1] < 0.0))
+    if turns_back < NOISY:
+        return _no_stretch()
+    starts = np.concatenate(([0], np.flatnonzero(steps) + 1))
+    usual = float(np.percentile(np.diff(starts, append=len(values)), 99.0))
+    limits = (float(values.min()), float(values.max()))
+    found: list[tuple[int, int]] = []
+    for first, last in _constant(readings, 0.0, LEAST_CURRENT_S):
+        part = motor_rad[readings.sample[first] : readings.sample[last] + 1]
+        is_moved = float(np.ptp(part)) >= MOVED * range_rad
+        if is_moved and last + 1 - first >= LONGER * usual and values[first] not in limits:
+            found.append((first, last))
+    return _samples(readings, found)
+
+
+def at_limit(readings: Readings, stretches: IntArray) -> bool:
+    """Whether every stretch is at the largest, or at the smallest, value of a channel."""
+    if not len(stretches):
+        return False
+    where = np.searchsorted(readings.sample, stretches[:, 0])
+    values = readings.values[where]
+    is_largest = bool(np.all(values == readings.values.max()))
+    is_smallest = bool(np.all(values == readings.values.min()))
+    return is_largest or is_smallest
+
+
+def covered(stretches: IntArray, samples: int) -> BoolArray:
+    """Samples of a run in one of the stretches, shape (k,)."""
+    inside = np.zeros(samples, dtype=np.bool_)
+    for first, end in stretches.tolist():
+        inside[first:end] = True
+    return inside
+
+
+def _constant(readings: Readings, tiny: float, least_s: float) -> list[tuple[int, int]]:
+    """First and last reading of every stretch that is constant for so long."""
+    changed = np.abs(np.diff(readings.values)) > tiny
+    first = np.concatenate(([0], np.flatnonzero(changed) + 1))
+    last = np.append(first[1:], len(readings.values)) - 1
+    long = readings.sample[last] + 1 - readings.sample[first] > least_s * readings.rate_hz
+    return list(zip(first[long].tolist(), last[long].tolist(), strict=True))
+
+
+def _samples(readings: Readings, found: list[tuple[int, int]]) -> IntArray:
+    if not found:
+        return _no_stretch()
+    return np.array([(readings.sample[first], readings.sample[last] + 1) for first, last in found], dtype=np.int64)
+
+
+def _no_stretch() -> IntArray:
+    return np.zeros((0, 2), dtype=np.int64)
