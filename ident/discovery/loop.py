@@ -42,7 +42,7 @@ from ident.discovery.joining import (
     refuted_by_structure,
 )
 from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
-from ident.discovery.resonance import propose_resonances, refined_gear
+from ident.discovery.resonance import gears_around, propose_resonances, refined_gear
 from ident.discovery.ripple import propose_orders
 from ident.discovery.rotor_search import propose_rotors
 from ident.discovery.search import (
@@ -450,7 +450,7 @@ def _turn(
         if accepted is None or known >= most:
             break
         near = (*proposed.get(accepted.axis, ()), *families)
-        effect = refined_gear(problem, refine_setting(problem, accepted.effect, accepted.axis, near), accepted.axis)
+        effect = _refined(problem, accepted, near)
         chosen, accepted = accepted, replace(accepted, effect=effect)
         refuted = refuted_by_structure(model, accepted, aside)
         progress(f"adding {effect.name} on {names[accepted.axis]}")
@@ -471,6 +471,15 @@ def _turn(
     elif moves < MIN_MOVES_FOR_STRUCTURE:
         ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
     return Step(findings, structures, limits_nm, None, evidence, tuple(aside), ended), None
+
+
+def _refined(search_problem: SearchProblem, accepted: Finding, near: Sequence[Sequence[Effect]]) -> Effect:
+    """Return the effect that was chosen with its setting refined; a gear that is not rigid also gets its form."""
+    effect = refine_setting(search_problem, accepted.effect, accepted.axis, near)
+    gear = refined_gear(search_problem, effect, accepted.axis)
+    if gear == effect:
+        return effect
+    return refine_setting(search_problem, gear, accepted.axis, (gears_around(gear),))
 
 
 def _proposals(

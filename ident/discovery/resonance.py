@@ -111,12 +111,12 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
         return effect
     forms: list[Effect] = [effect]
     for held in (0, 1):
-        tried: list[Elasticity | Backlash] = []
+        tried: list[Effect] = []
         shares: list[float] = []
         for rotor in _rotors(search_problem, axis) if held else (0.0,):
             for ratio in HELD_DAMPING if held else (effect.damping_ratio,):
-                form = replace(effect, held=held, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
-                gears = _around(form)
+                form = replace(effect, held=held, sags=1, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
+                gears = gears_around(form)
                 tried += gears
                 shares += _explained(search_problem, axis, gears)
         forms.append(tried[int(np.argmax(shares))])
@@ -128,9 +128,11 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
     return forms[int(np.argmax(falls))]
 
 
-def _around(gear: Elasticity | Backlash) -> list[Elasticity | Backlash]:
-    """Gears that are stiffer and softer than one, and have larger and smaller gaps where it has one."""
-    around: list[Elasticity | Backlash] = []
+def gears_around(gear: Effect) -> list[Effect]:
+    """Return gears that are stiffer and softer than one, and have larger and smaller gaps where it has one."""
+    around: list[Effect] = []
+    if not isinstance(gear, Elasticity | Backlash):
+        return around
     for factor in NEAR_FACTORS:
         compliance = _rounded(gear.resonant_rad_nm * factor)
         if isinstance(gear, Elasticity):
@@ -151,16 +153,16 @@ def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
     return tuple(float(f"{share * largest:.3g}") for share in ROTOR_SHARES)
 
 
-def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Elasticity | Backlash]) -> list[float]:
+def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Effect]) -> list[float]:
     """Share of the squared residual that gears explain on the joint itself; all have one damping, form and rotor."""
-    first = gears[0]
+    common = gears[0].settings
     gaps = np.array([gear.settings.get("half_gap_rad", 0.0) for gear in gears])
-    compliances = np.array([gear.resonant_rad_nm for gear in gears])
-    several = Gears(gaps, compliances, first.damping_ratio)
+    compliances = np.array([gear.settings["resonant_rad_nm"] for gear in gears])
+    several = Gears(gaps, compliances, common["damping_ratio"])
 
     def behind(run: Signals) -> FloatArray:
-        signals = beside_rotor(run, axis, first.rotor_inertia_kg_m2)
-        found = twists(link_of(signals, axis, held=bool(first.held)), several)
+        signals = beside_rotor(run, axis, common["rotor_inertia_kg_m2"])
+        found = twists(link_of(signals, axis, held=bool(common["held"])), several)
         return found.passed_nm - signals.gear_torque(axis)
 
     return [float(share) for share in shares_explained(search_problem, _tried(search_problem, axis, behind))]

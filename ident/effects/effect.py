@@ -234,6 +234,7 @@ ADDED = frozenset(
         "resonant_rad_nm",
         "damping_ratio",
         "held",
+        "sags",
         "two_terms",
         "filter_s",
         "backwards",
@@ -243,7 +244,7 @@ ADDED = frozenset(
 )
 """Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
 
-FORMS = frozenset({"held", "two_terms", "backwards", "rotor_inertia_kg_m2", "with_rotor"})
+FORMS = frozenset({"held", "sags", "two_terms", "backwards", "rotor_inertia_kg_m2", "with_rotor"})
 """Settings that choose a form of one effect: a search counts an effect in two forms as one."""
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike

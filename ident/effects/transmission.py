@@ -43,6 +43,7 @@ class Backlash(Effect):
     resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0  #: c₀, compliance of the flanks
     damping_ratio: Annotated[float, Range(0.0, 10.0)] = 0.0  #: ζ
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
+    sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
@@ -50,12 +51,14 @@ class Backlash(Effect):
         if self.half_gap_rad > 0.0 and self.resonant_rad_nm > 0.0:
             gear = Gears(np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio)
             known = beside_rotor(signals, axis, self.rotor_inertia_kg_m2)
-            return _behind(gear, known, axis, held=bool(self.held)) / self.half_gap_rad
+            return _behind(gear, known, axis, held=bool(self.held), sags=bool(self.sags)) / self.half_gap_rad
         torque = signals.gear_torque(axis)
         width = self.share * float(np.sqrt(np.mean(torque**2))) or 1.0
         twist = np.tanh(torque / width)
-        bend = curvature(twist, signals.rate_hz)
-        return np.asarray(torque_of_twist(signals, axis, twist) - signals.inertia(slice(None), axis) * bend)[:, None]
+        added = -signals.inertia(slice(None), axis) * curvature(twist, signals.rate_hz)
+        if self.sags:
+            added += torque_of_twist(signals, axis, twist)
+        return np.asarray(added)[:, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +68,12 @@ class Elasticity(Effect):
     Joint j lags its motor by y/k, so its acceleration is less than the motor's by ÿ/k, and every joint i takes M_ij
     times as much torque less, beside D_i, what the posture changes; M is the mass matrix in that posture, τ_j the
     torque that a rigid gear would pass, without its friction, and y what the spring passes: τ_j through the resonance
-    of spring and link. With c₀ = 0, y is τ_j, the first order in c: good well below the resonance. Where its own
-    friction holds the link, the motor winds up the spring first (`ident.effects.twist`), and τ_j = c (y − τ_j)/c₀ on
-    the joint itself: the spring passes neither weight nor friction of a link at rest. Source: Spong (1987), "Modeling
-    and control of elastic joint robots", with the encoder on the motor. Signature: second derivative of the load,
-    larger near the resonance.
+    of spring and link. With c₀ = 0, y is τ_j, the first order in c: good well below the resonance. D_i is left out
+    until an elasticity is chosen: a sag alone is no sign of one, because gravity that is described wrongly looks alike.
+    Where its own friction holds the link, the motor winds up the spring first (`ident.effects.twist`), and
+    τ_j = c (y − τ_j)/c₀ on the joint itself: the spring passes neither weight nor friction of a link at rest. Source:
+    Spong (1987), "Modeling and control of elastic joint robots", with the encoder on the motor. Signature: second
+    derivative of the load, larger near the resonance.
     """
 
     name = "elasticity"
@@ -81,6 +85,7 @@ class Elasticity(Effect):
     resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0  #: c₀, the compliance that sets the resonance
     damping_ratio: Annotated[float, Range(0.0, 10.0)] = 0.0  #: ζ
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
+    sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
@@ -88,15 +93,17 @@ class Elasticity(Effect):
         if self.held and self.resonant_rad_nm > 0.0:
             gear = Gears(np.zeros(1), np.array([self.resonant_rad_nm]), self.damping_ratio)
             known = beside_rotor(signals, axis, self.rotor_inertia_kg_m2)
-            return _behind(gear, known, axis, held=True) / self.resonant_rad_nm
+            return _behind(gear, known, axis, held=True, sags=bool(self.sags)) / self.resonant_rad_nm
         inertia = signals.inertia(slice(None), axis)
         torque = signals.link_torque(axis)
         passed = spring_torque(torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio)
-        bend = curvature(passed, signals.rate_hz)
-        return np.asarray(torque_of_twist(signals, axis, passed) - inertia * bend)[:, None]
+        added = -inertia * curvature(passed, signals.rate_hz)
+        if self.sags:
+            added += torque_of_twist(signals, axis, passed)
+        return np.asarray(added)[:, None]
 
 
-def _behind(gear: Gears, signals: Signals, axis: int, *, held: bool) -> FloatArray:
+def _behind(gear: Gears, signals: Signals, axis: int, *, held: bool, sags: bool) -> FloatArray:
     """Torque that a gear which is not rigid adds on every joint, shape (n, 1, k).
 
     Args:
@@ -104,10 +111,12 @@ def _behind(gear: Gears, signals: Signals, axis: int, *, held: bool) -> FloatArr
         signals: of the run.
         axis: joint behind it.
         held: the link's own friction holds it; the gear then passes neither its weight nor its friction.
+        sags: with what the twist changes in the posture of the arm.
     """
     found = twists(link_of(signals, axis, held=held), gear)
-    twist = found.twist_rad[0]
-    added = torque_of_twist(signals, axis, twist) - signals.inertia(slice(None), axis) * found.acceleration_rad_s2[0]
+    added = -signals.inertia(slice(None), axis) * found.acceleration_rad_s2[0]
+    if sags:
+        added += torque_of_twist(signals, axis, found.twist_rad[0])
     if held:
         added[axis] = found.passed_nm[0] - signals.gear_torque(axis)
     return np.asarray(added)[:, None]
