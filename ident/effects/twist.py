@@ -178,7 +178,6 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
     fastest_rad_s = 1.0 / float(np.sqrt(np.min(inertia_kg_m2) * np.min(compliance)))
     steps = min(MOST_STEPS, int(np.ceil(fastest_rad_s / rate_hz / STEP_RAD)))
     step_s = 1.0 / (steps * rate_hz)
-    has_gap = gap > 0.0
     has_friction = bool(np.any(link.dry_nm > 0.0))
     begin = windows.begin
     twist = around.twist_rad[:, begin]
@@ -186,6 +185,9 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
     twisted = around.twist_rad.copy()
     bent = around.acceleration_rad_s2.copy()
     passed = around.passed_nm.copy()
+    # Means from one sample to the next lie half a sample late: each sample gets that of the means on its two sides.
+    bend_before = np.zeros_like(rate)
+    flank_before = np.zeros_like(rate)
     for sample in range(int(windows.length[0])):
         running = int(np.searchsorted(-windows.length, -sample))
         at = begin[:running] + sample
@@ -203,11 +205,7 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
         flanks = np.zeros_like(delta)
         for part in range(steps):
             share = part / steps
-            pressed = delta - np.clip(delta, -gap, gap)
-            flank = pressed / compliance + damping * speed
-            pushing = np.where(pressed > 0.0, np.maximum(flank, 0.0), np.minimum(flank, 0.0))
-            pushing = np.where(pressed == 0.0, 0.0, pushing)
-            flank = np.where(has_gap, pushing, flank)
+            flank = _flank(delta, speed, gap, compliance, damping)
             flanks += flank
             speed += step_s * (before + rise * share - flank) / mass
             if has_friction:
@@ -215,9 +213,28 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
                 sliding = motor + motor_rise * share - speed
                 speed += np.clip(sliding, -holding, holding)
             delta += step_s * speed
-        bent[:, at] = (speed - speed_before) * rate_hz
-        passed[:, at] = flanks / steps
+        bend = (speed - speed_before) * rate_hz
+        flank = flanks / steps
+        bent[:, at] = bend if sample == 0 else 0.5 * (bend_before[:, :running] + bend)
+        passed[:, at] = flank if sample == 0 else 0.5 * (flank_before[:, :running] + flank)
+        bend_before = bend
+        flank_before = flank
     return Twists(twisted, bent, passed)
+
+
+def _flank(
+    twist_rad: FloatArray,
+    rate_rad_s: FloatArray,
+    half_gap_rad: FloatArray,
+    compliance_rad_nm: FloatArray,
+    damping_nm_s_rad: FloatArray,
+) -> FloatArray:
+    """What a spring passes; of a gear with a gap, what a flank does: nothing in the gap, and it never pulls."""
+    pressed = twist_rad - np.clip(twist_rad, -half_gap_rad, half_gap_rad)
+    spring = pressed / compliance_rad_nm + damping_nm_s_rad * rate_rad_s
+    pushing = np.where(pressed > 0.0, np.maximum(spring, 0.0), np.minimum(spring, 0.0))
+    in_touch = np.where(pressed == 0.0, 0.0, pushing)
+    return np.asarray(np.where(half_gap_rad > 0.0, in_touch, spring))
 
 
 def torque_of_twist(signals: Signals, axis: int, twist_rad: FloatArray) -> FloatArray:

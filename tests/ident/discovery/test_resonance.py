@@ -68,6 +68,8 @@ def _stepped(
         bends[k] = (rate - before) * rate_hz
     twists_rad[-1] = twist
     bends[-1] = bends[-2]
+    # Of the means from each sample to the next, those on both sides of a sample.
+    bends[1:] = 0.5 * (bends[:-1] + bends[1:])
     return twists_rad, bends
 
 

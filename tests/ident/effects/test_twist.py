@@ -69,6 +69,8 @@ def _stepped(link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_r
             summed += force
         passed[sample] = summed / STEPS
     passed[-1] = passed[-2]
+    # Of the means from each sample to the next, those on both sides of a sample.
+    passed[1:] = 0.5 * (passed[:-1] + passed[1:])
     return passed
 
 
