@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.frozen import at_limit, frozen_current, frozen_position
+from ident.data.frozen import clipped_position, frozen_current, frozen_position
 from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
 from ident.data.held import fill_damaged, held_channel, longest_smooth
 
@@ -76,9 +76,10 @@ class ChannelFault:
         """Whether the recording cannot be used."""
         if self.kind is FaultKind.GLITCH:
             return self.share > LARGEST_GLITCHED
-        if self.is_left_out:
+        if self.kind is FaultKind.FROZEN:
             return self.share > LARGEST_FROZEN
-        return True
+        # What stands at the end of a range may be a joint that a simple device has stopped there.
+        return self.kind is not FaultKind.CLIPPED
 
     @property
     def is_filled(self) -> bool:
@@ -326,16 +327,20 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
 
 def _position_faults(readings: Readings, place: ChannelPlace) -> Iterator[ChannelFault]:
     jumps = find_jumps(readings, is_position=True)
-    whole = wrap_size(readings, jumps)
+    whole = wrap_size(readings, jumps, is_position=True)
     if whole is not None:
         yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
         return
     if jumps.glitches:
         yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
-    frozen = frozen_position(_without(readings, jumps))
+    moved = _without(readings, jumps)
+    frozen = frozen_position(moved)
     if len(frozen):
-        kind = FaultKind.CLIPPED if at_limit(readings, frozen) else FaultKind.FROZEN
-        yield place.fault(kind, readings, frozen)
+        yield place.fault(FaultKind.FROZEN, readings, frozen)
+    else:
+        clipped = clipped_position(moved)
+        if len(clipped):
+            yield place.fault(FaultKind.CLIPPED, readings, clipped)
     steps = np.abs(np.diff(readings.values))
     usual = float(np.percentile(steps, USUAL_PERCENTILE)) if len(steps) else 0.0
     lost = np.abs(jumps.step_size) > LOST_PLACE * usual
@@ -354,7 +359,7 @@ def _current_faults(readings: Readings, motor_rad: FloatArray, place: ChannelPla
         yield place.fault(FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes)))
         return
     jumps = find_jumps(readings, is_position=False)
-    whole = wrap_size(readings, jumps)
+    whole = wrap_size(readings, jumps, is_position=False)
     if whole is not None:
         yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
         return

@@ -1,7 +1,9 @@
 """Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
 
-A joint that stops comes to rest over some samples, and starts from rest. A frozen position stands still from one sample
-to the next, or goes on with a jump. A frozen current lacks its noise while its motor moves.
+A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only stops from one sample
+to the next is none: a robot may run into something, and a simple device may know no acceleration. A position at the end
+of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise while its
+motor moves.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ ABRUPT = 3.0
 what a motor has on its way to a standstill is half of that."""
 USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
+JUMP = 3.0  #: Jump at the end of a frozen stretch, in multiples of the largest usual step
 BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
 NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
@@ -31,6 +34,31 @@ def frozen_position(readings: Readings) -> IntArray:
     Args:
         readings: of a motor's position.
     """
+    steps = np.abs(np.diff(readings.values))
+    usual = float(np.percentile(steps, 99.0)) if len(steps) else 0.0
+    if not usual > 0.0:
+        return _no_stretch()  # nothing says how fast it moves
+    least = JUMP * usual + ABRUPT_COUNTS * readings.count
+    tiny = ROUNDING * float(np.ptp(readings.values))
+    found: list[tuple[int, int]] = []
+    for first, last in _constant(readings, tiny, LEAST_S):
+        if last < len(steps) and steps[last] > least:
+            found.append((first, last))
+    return _samples(readings, found)
+
+
+def clipped_position(readings: Readings) -> IntArray:
+    """Stretches in which a position stands at the largest, or the smallest, value of its range, shape (s, 2).
+
+    Args:
+        readings: of a motor's position.
+    """
+    stretches = _abrupt(readings)
+    return stretches if at_limit(readings, stretches) else _no_stretch()
+
+
+def _abrupt(readings: Readings) -> IntArray:
+    """Stretches in which a position is constant and that begin or end without any acceleration, shape (s, 2)."""
     tiny = ROUNDING * float(np.ptp(readings.values))
     stretches = _constant(readings, tiny, LEAST_S)
     samples = int(readings.sample[-1]) + 1

@@ -103,7 +103,7 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
     return Jumps(tuple(glitches), step[left], size[left])
 
 
-def wrap_size(readings: Readings, jumps: Jumps) -> float | None:
+def wrap_size(readings: Readings, jumps: Jumps, *, is_position: bool) -> float | None:
     """Range of a counter that wraps, in the unit of the channel; None where none does.
 
     It goes on a whole range aside, again and again, and never leaves that range.
@@ -115,6 +115,10 @@ def wrap_size(readings: Readings, jumps: Jumps) -> float | None:
     is_same = np.abs(sizes - whole) <= SAME_SIZE * whole
     range_ = float(np.ptp(readings.values))
     is_seen = WRAP_SHARE * whole <= range_ <= (1.0 + SAME_SIZE) * whole
+    place = (readings.values - readings.values.min()) / range_ if range_ > 0.0 else np.zeros(1)
+    in_middle = float(np.mean((place > EMPTY_FROM) & (place < EMPTY_TO)))
+    # A counter goes through its range; a current that friction turns between two values does not.
+    is_seen = is_seen and (is_position or in_middle >= LEAST_SPLIT)
     # A single step may be that of an encoder that has lost its place.
     return whole if is_seen and np.count_nonzero(is_same) >= 2 and np.mean(is_same) > 0.5 else None
 
@@ -197,9 +201,12 @@ def _glitch_from(
 def is_split(values: FloatArray) -> BoolArray | None:
     """Whether each value is in the upper part of a range whose middle is empty, shape (k,); None where it is not.
 
-    A signed number that is read without its sign has its negative values at the other end of the counter's range.
+    A signed number that is read without its sign has its negative values at the other end of the counter's range, and
+    all have one sign: a current that friction alone turns between two values has both.
     """
     lowest = float(values.min())
+    if lowest < 0.0 < float(values.max()):
+        return None
     range_ = float(values.max()) - lowest
     if not range_ > 0.0:
         return None

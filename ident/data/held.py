@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # loads scipy.interpolate when it is first used: most fits need none of it
 
 from ident.arrays import BoolArray, FloatArray
 
@@ -120,7 +119,9 @@ def without_held(values: FloatArray, rate_hz: float, *, smooth: bool, damaged: B
     read = ~held & ~damaged
     held = ~read
     if smooth:
-        filled = scipy.interpolate.CubicSpline(sample[read], values[read])(sample[held])
+        from scipy.interpolate import CubicSpline  # noqa: PLC0415 - verbs that only judge a log need no scipy
+
+        filled = CubicSpline(sample[read], values[read])(sample[held])
     else:
         filled = np.interp(sample[held], sample[read], values[read])
     out = values.copy()

@@ -163,10 +163,6 @@ def _frozen(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
     joint_rad[3500:4400, 1] = joint_rad[3500, 1]
 
 
-def _clipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
-    joint_rad[:, 1] = np.minimum(joint_rad[:, 1], np.percentile(joint_rad[:, 1], 80.0))
-
-
 def _without_sign(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
     current[:, 1] = np.mod(current[:, 1], 2**16)
 
@@ -175,7 +171,7 @@ def _slipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
     joint_rad[1500:, 1] += 0.004
 
 
-FAULTS = {"frozen": _frozen, "clipped": _clipped, "without its sign": _without_sign, "slipped": _slipped}
+FAULTS = {"frozen": _frozen, "without its sign": _without_sign, "slipped": _slipped}
 
 
 @pytest.mark.parametrize("kind", FAULTS)
