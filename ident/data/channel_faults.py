@@ -25,7 +25,8 @@ LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
 LOST_PLACE = 3.0
 """Least step of a position after which it does not return, in multiples of its largest usual step."""
 USUAL_PERCENTILE = 99.0  #: Of the steps of a position
-MOTOR_UNIT, JOINT_UNIT = "rad of the motor", "rad or m of the joint"
+MOTOR_UNIT = "rad of the motor"
+JOINT_UNIT = "rad or m of the joint"
 ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
 
 

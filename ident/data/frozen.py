@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import FloatArray, IntArray
 from ident.data.glitches import Readings
 from ident.data.held import ROUNDING
 
@@ -22,6 +22,7 @@ what a motor has on its way to a standstill is half of that."""
 USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
 JUMP = 3.0  #: Jump at the end of a frozen stretch, in multiples of the largest usual step
+STEP_PERCENTILE = 99.0  #: Of the steps of a position: the largest usual one
 BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
 NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
@@ -35,7 +36,7 @@ def frozen_position(readings: Readings) -> IntArray:
         readings: of a motor's position.
     """
     steps = np.abs(np.diff(readings.values))
-    usual = float(np.percentile(steps, 99.0)) if len(steps) else 0.0
+    usual = float(np.percentile(steps, STEP_PERCENTILE)) if len(steps) else 0.0
     if not usual > 0.0:
         return _no_stretch()  # nothing says how fast it moves
     least = JUMP * usual + ABRUPT_COUNTS * readings.count
@@ -128,14 +129,6 @@ def at_limit(readings: Readings, stretches: IntArray) -> bool:
     is_largest = bool(np.all(values == readings.values.max()))
     is_smallest = bool(np.all(values == readings.values.min()))
     return is_largest or is_smallest
-
-
-def covered(stretches: IntArray, samples: int) -> BoolArray:
-    """Samples of a run in one of the stretches, shape (k,)."""
-    inside = np.zeros(samples, dtype=np.bool_)
-    for first, end in stretches.tolist():
-        inside[first:end] = True
-    return inside
 
 
 def _constant(readings: Readings, tiny: float, least_s: float) -> list[tuple[int, int]]:

@@ -39,7 +39,7 @@ DAMPING_RATIOS = (0.1, 0.25)
 HALF_GAPS_RAD = (2e-4, 3.2e-4, 5e-4, 8e-4, 1.3e-3, 2e-3, 3.2e-3, 5e-3, 8e-3)
 FLANKS_HZ = (15.0, 25.0, 40.0)
 FLANK_DAMPING = 0.2
-HELD_DAMPING = (0.1, 0.25, 0.5)
+HELD_DAMPING = (0.1, 0.25, 0.5)  #: Damping ratios of a link that its own friction holds
 NEAR_FACTORS = (0.5, 0.62, 0.79, 1.0, 1.27, 1.6, 2.0)  #: Of the compliance that was chosen
 GAP_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)  #: Of the gap that was chosen
 ROTOR_SHARES = (0.0, 0.25, 0.5, 0.75)  #: Of the largest inertia that the rotor of an axis can have
@@ -191,8 +191,8 @@ def _compliances(inertia_kg_m2: float, frequencies_hz: Sequence[float]) -> tuple
     return tuple(_rounded(1.0 / (inertia_kg_m2 * (2.0 * np.pi * hz) ** 2)) for hz in frequencies_hz)
 
 
-def _rounded(compliance_rad_nm: float) -> float:
-    return float(f"{compliance_rad_nm:.4g}")
+def _rounded(setting: float) -> float:
+    return float(f"{setting:.4g}")
 
 
 def _tried(

@@ -22,7 +22,8 @@ UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier one
 REFERENCE_C = 40.0
 """Temperature at which the declared friction holds beside a friction that depends on it; motors are rated at this
 ambient temperature (IEC 60034-1). The fit is the same for any; a fixed one keeps calibrations comparable."""
-TWIST_RAD, TWIST_RAD_S = 1e-4, 1e-3  #: Steps of the derivatives to the position and the velocity of a joint
+TWIST_RAD = 1e-4  #: Step of the derivative to the position of a joint
+TWIST_RAD_S = 1e-3  #: Step of the derivative to its velocity
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 

@@ -35,7 +35,7 @@ MOST_STEPS = 16  #: Of a sample
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenLink:
-    """What moves a link behind a gear, shape (k,) each."""
+    """What moves a link behind a gear; arrays have the shape (k,)."""
 
     rate_hz: float  #: sampling rate
     inertia_kg_m2: FloatArray  #: M_jj of link and payload in each posture
@@ -213,12 +213,12 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
                 sliding = motor + motor_rise * share - speed
                 speed += np.clip(sliding, -holding, holding)
             delta += step_s * speed
-        bend = (speed - speed_before) * rate_hz
-        flank = flanks / steps
-        bent[:, at] = bend if sample == 0 else 0.5 * (bend_before[:, :running] + bend)
-        passed[:, at] = flank if sample == 0 else 0.5 * (flank_before[:, :running] + flank)
-        bend_before = bend
-        flank_before = flank
+        mean_bend = (speed - speed_before) * rate_hz
+        mean_flank = flanks / steps
+        bent[:, at] = mean_bend if sample == 0 else 0.5 * (bend_before[:, :running] + mean_bend)
+        passed[:, at] = mean_flank if sample == 0 else 0.5 * (flank_before[:, :running] + mean_flank)
+        bend_before = mean_bend
+        flank_before = mean_flank
     return Twists(twisted, bent, passed)
 
 

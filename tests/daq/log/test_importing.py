@@ -364,7 +364,7 @@ def test_a_step_of_an_axis_that_rests_is_refused_too(bench: Bench, capsys: pytes
 
 
 SMALL_GLITCH_DEG = 1.5
-"""No faster than the axis may move between two samples."""
+"""A step that `check_steps` accepts beside the motion of this axis."""
 
 
 def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(

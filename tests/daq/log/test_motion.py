@@ -135,7 +135,7 @@ def test_every_verb_refuses_a_glitch(
 
 
 SMALL_GLITCH_RAD = 0.002
-"""Of one sample: no faster than the motor may turn."""
+"""Less than J2 may move within a sample by its velocity limit, 3.5 mrad."""
 
 
 def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_path: Path) -> None:

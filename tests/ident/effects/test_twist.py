@@ -158,6 +158,7 @@ def test_a_constant_twist_is_a_zero_that_is_off(run: Signals) -> None:
     expected = run.arm.load_change(replace(run.arm.motion, position_rad=position))
     found = torque_of_twist(run, AXIS, np.full(len(run.time_s), half_gap))
     assert np.abs(expected).max() > 1e-3
+    # Derivatives are interpolated between postures 10 ms apart.
     assert found == pytest.approx(expected, abs=5e-3 * np.abs(expected).max())
 
 
