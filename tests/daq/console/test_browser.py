@@ -31,7 +31,7 @@ from daq.log.feed import Feed, QuickGain, QuickLook
 from daq.log.reader import Log, read_log
 from daq.log.salvage import salvage
 from drivers.messages import EventKind
-from tests.daq.console.feeds import TOKEN, Recording, predicting_calibration, served
+from tests.daq.console.feeds import TOKEN, Recording, arrivals, predicting_calibration, served
 
 CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")
 pytestmark = [
@@ -396,10 +396,14 @@ def test_the_session_shows_the_gains_after_each_move(browser: Browser, cell: Cel
     _state_after_three_blocks(cell, folder)
     gains = [QuickGain(axis.name, axis.gain_unit, 10.0, 0.8, 0.5) for axis in cell.axes]
     look = QuickLook("block-4-loaded", 1, 9, 44.0, gains=gains, why="it needs more moves", left_s=69.0)
-    with served(cell_file, cell) as console, Feed(cell_file) as feed, browser.new_context() as context:
+    feed = Feed(cell_file)
+    accepted = arrivals(feed)
+    with served(cell_file, cell) as console, feed, browser.new_context() as context:
         page = context.new_page()
         page.goto(f"http://127.0.0.1:{console.port}/{TOKEN}/")
         until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
+        # A console is connected before the feed accepts it: what is published in between is for nobody.
+        assert accepted.wait(HEARD_S)
         recording = Recording(feed, cell, folder / "block-4-loaded.mcap")
         for number in (1, 2):
             feed.look(replace(look, move=number, motion_s=40.0 + 4.0 * number))
