@@ -221,13 +221,8 @@ class CanopenNetwork:
         answered = answering(self.link, self.node_ids, self.bounds.answer_s)
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
-        try:
+        with self._second_device_named():
             identities = tuple(read_identity(self.objects(axis)) for axis in self.axes)
-        except ObjectAccessError:
-            # The refusal may be that of a second device with this node id, which was faster.
-            self.link.wait(SECOND_ANSWER_S)
-            self._require_own_ids(0)
-            raise
         self._require_own_ids(0)
         for axis, found in zip(self.axes, identities, strict=True):
             if axis.identity is not None and (differing := axis.identity.differences(found)):
@@ -237,6 +232,16 @@ class CanopenNetwork:
                     "hardware",
                 )
         return identities
+
+    @contextmanager
+    def _second_device_named(self) -> Iterator[None]:
+        """Where a node refuses, look for a second device with its node id first: that one may have refused."""
+        try:
+            yield
+        except (ObjectAccessError, SetupRefused):
+            self.link.wait(SECOND_ANSWER_S)
+            self._require_own_ids(0)
+            raise
 
     def _require_own_ids(self, period_ms: int) -> None:
         """Refuse an axis whose node id another device has too; `period_ms` is that of its heartbeat, 0 if unknown."""
@@ -258,6 +263,10 @@ class CanopenNetwork:
             NodeMissing, SetupRefused, StateRefused, ObjectAccessError, BusError: see drivers/errors.py.
         """
         self.require_quiet()
+        with self._second_device_named():
+            self._set_up()
+
+    def _set_up(self) -> None:
         identities = self.check_identities()
         consumers = [read_consumers(self.objects(axis)) for axis in self.axes]
         if self.link.own_id is None:

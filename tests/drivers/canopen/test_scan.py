@@ -150,6 +150,17 @@ def test_a_second_device_that_refuses_first_is_named_too() -> None:
         network.prepare()
 
 
+def test_a_second_device_that_answers_late_and_refuses_is_named() -> None:
+    """It is silent, as a busy one is, until the PDOs are mapped: an abort alone would send one to the mapping."""
+    network, bus = cell(2)
+    other = Hostile(2, bus, lambda data, _: None if about(data) >= 0x1600 else b"")
+    other.objects = {key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)}
+    other.beats = False
+    bus.nodes = (bus.nodes[0], other, bus.nodes[1])
+    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
+        network.prepare()
+
+
 def heartbeat(state: int) -> can.Message:
     return can.Message(arbitration_id=0x702, is_extended_id=False, data=bytes((state,)))
 
