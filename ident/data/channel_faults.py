@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.frozen import clipped_position, frozen_current, frozen_position
+from ident.data.frozen import clipped_position, frozen_current, frozen_position, frozen_to_the_end
 from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
 from ident.data.held import fill_damaged, held_channel, longest_smooth
 
@@ -120,7 +120,8 @@ def find_faults(
     found: list[ChannelFault] = []
     read = position if ratio is None else motor_positions(position, ratio)
     for axis, readings in enumerate(_readings(read, rate_hz)):
-        found += _position_faults(readings, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit))
+        others = np.delete(read, axis, axis=1)
+        found += _position_faults(readings, others, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit))
     if ratio is not None:
         found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
@@ -191,7 +192,9 @@ def _with_joints(
         own = [one for one in found if turned_by[joint, one.axis]]
         if any(one.kind is not FaultKind.DISPLACED for one in own):
             continue
-        faults = list(_position_faults(readings, ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)))
+        others = np.delete(position, joint, axis=1)
+        place = ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)
+        faults = list(_position_faults(readings, others, place))
         if any(one.is_left_out for one in faults):
             found = [one for one in found if one not in own]
         if any(one.is_left_out for one in faults) or not own:
@@ -326,7 +329,8 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
         yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
 
 
-def _position_faults(readings: Readings, place: ChannelPlace) -> Iterator[ChannelFault]:
+def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+    """Judge a position, beside those of the other columns, shape (k, n − 1)."""
     jumps = find_jumps(readings, is_position=True)
     whole = wrap_size(readings, jumps, is_position=True)
     if whole is not None:
@@ -335,7 +339,7 @@ def _position_faults(readings: Readings, place: ChannelPlace) -> Iterator[Channe
     if jumps.glitches:
         yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
     moved = _without(readings, jumps)
-    frozen = frozen_position(moved)
+    frozen = np.concatenate((frozen_position(moved), frozen_to_the_end(moved, others)))
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
     else:

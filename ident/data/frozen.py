@@ -1,9 +1,10 @@
 """Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
 
 A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only stops from one sample
-to the next is none: a robot may run into something, and a simple device may know no acceleration. A position at the end
-of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise while its
-motor moves.
+to the next is none: a robot may run into something, and a simple device may know no acceleration. One that never goes on
+is frozen where every other stop and turn of its motor was far gentler, and the other motors still move. A position at the
+end of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise while
+its motor moves.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ STEP_PERCENTILE = 99.0  #: Of the steps of a position: the largest usual one
 BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
 NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
-MOVED = 0.02  #: Least way of a motor in a stretch in which its current should change, as a share of its range
+MOVED = 0.02  #: Least way of a motor that moves in a stretch, as a share of its range
+LEAST_TURNS = 2  #: Changes of direction that show how gently a motor slows down
+LATER_S = 0.5  #: Time after a stop in which other motors may still come to rest with it
 
 
 def frozen_position(readings: Readings) -> IntArray:
@@ -48,6 +51,48 @@ def frozen_position(readings: Readings) -> IntArray:
     return _samples(readings, found)
 
 
+def frozen_to_the_end(readings: Readings, others: FloatArray) -> IntArray:
+    """The stretch in which a position is frozen until the end of a recording, shape (0 or 1, 2).
+
+    Args:
+        readings: of a motor's position.
+        others: positions of the other motors at every sample, shape (k, n − 1).
+    """
+    tiny = ROUNDING * float(np.ptp(readings.values))
+    stretches = _constant(readings, tiny, LEAST_S)
+    if not stretches or stretches[-1][1] != len(readings.values) - 1:
+        return _no_stretch()
+    first, last = stretches[-1]
+    begin = int(readings.sample[first])
+    if not _go_on(others, begin + round(LATER_S * readings.rate_hz)):
+        return _no_stretch()
+    beside = _samples_beside(readings)
+    course = _course(readings)[: begin + 1]
+    if len(course) <= 4 * beside:
+        return _no_stretch()
+    way = course[beside:] - course[:-beside]
+    speed_changes = np.abs(way[beside:] - way[:-beside])[: -2 * beside]
+    least_way = ABRUPT_COUNTS * readings.count
+    directions = np.sign(way[np.abs(way) > least_way])
+    if np.count_nonzero(np.diff(directions)) < LEAST_TURNS:
+        return _no_stretch()
+    usual = float(np.max(speed_changes))
+    stopped_from = abs(float(way[-1]))
+    if stopped_from <= ABRUPT * usual + least_way:
+        return _no_stretch()
+    return _samples(readings, [(first, last)])
+
+
+def _go_on(others: FloatArray, sample: int) -> bool:
+    """Whether any of the other motors moves after a sample."""
+    later = others[sample:]
+    if not later.size:
+        return False
+    way = np.ptp(later, axis=0)
+    whole_range = np.ptp(others, axis=0)
+    return bool(np.any((way > 0.0) & (way >= MOVED * whole_range)))
+
+
 def clipped_position(readings: Readings) -> IntArray:
     """Stretches in which a position stands at the largest, or the smallest, value of its range, shape (s, 2).
 
@@ -62,12 +107,10 @@ def _abrupt(readings: Readings) -> IntArray:
     """Stretches in which a position is constant and that begin or end without any acceleration, shape (s, 2)."""
     tiny = ROUNDING * float(np.ptp(readings.values))
     stretches = _constant(readings, tiny, LEAST_S)
-    samples = int(readings.sample[-1]) + 1
-    beside = max(LEAST_BESIDE, round(BESIDE_S * readings.rate_hz))
-    if not stretches or samples <= 4 * beside:
+    beside = _samples_beside(readings)
+    course = _course(readings)
+    if not stretches or len(course) <= 4 * beside:
         return _no_stretch()
-    # A held reading is on the way to the next one.
-    course = np.interp(np.arange(samples), readings.sample, readings.values)
     way = np.abs(course[beside:] - course[:-beside])
     changes = np.abs(course[2 * beside :] - 2.0 * course[beside:-beside] + course[: -2 * beside])
     counts = way[beside:] > tiny
@@ -118,6 +161,17 @@ def frozen_current(readings: Readings, motor_rad: FloatArray) -> IntArray:
         if is_moved and last + 1 - first >= LONGER * usual and values[first] not in limits:
             found.append((first, last))
     return _samples(readings, found)
+
+
+def _samples_beside(readings: Readings) -> int:
+    """Samples in BESIDE_S."""
+    return max(LEAST_BESIDE, round(BESIDE_S * readings.rate_hz))
+
+
+def _course(readings: Readings) -> FloatArray:
+    """A channel at every sample, from the first to the last reading; a held reading is on the way to the next one."""
+    samples = np.arange(int(readings.sample[-1]) + 1)
+    return np.asarray(np.interp(samples, readings.sample, readings.values))
 
 
 def at_limit(readings: Readings, stretches: IntArray) -> bool:

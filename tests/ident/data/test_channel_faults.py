@@ -261,6 +261,27 @@ def test_a_frozen_position_is_left_out_on_every_axis(seconds: float) -> None:
     assert data.valid[end + 101 :].all()
 
 
+@pytest.mark.parametrize("begin_s", [2.0, 3.1, 4.0])
+def test_a_position_that_freezes_to_the_end_is_found(begin_s: float) -> None:
+    begin = round(begin_s * RATE_HZ)
+    position, current = planted(lambda channel: np.copyto(channel[begin:], channel[begin]))
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert (found.kind, found.quantity, found.axis) == (FaultKind.FROZEN, ChannelKind.POSITION, 1)
+    assert found.stretches.tolist() == [[begin, len(position)]]
+
+
+def test_a_robot_that_is_stopped_at_once_is_not_frozen() -> None:
+    position, _ = planted(lambda _: None)
+    position[3300:] = position[3300]
+    assert find_faults(position, currents(position), RATE_HZ) == ()
+
+
+def test_an_axis_without_acceleration_that_is_done_before_the_others_is_not_frozen() -> None:
+    position, _ = planted(lambda _: None)
+    position[:, 1] = np.interp(TIME_S, [0.0, 1.0, 1.6, 2.0, 2.4, 3.0], [0.0, 5.0, 2.0, 9.0, 1.0, 6.0])
+    assert find_faults(position, currents(position), RATE_HZ) == ()
+
+
 def test_a_frozen_current_is_left_out_on_its_axis() -> None:
     position, current = planted(lambda channel: np.copyto(channel[1500:1800], channel[1500]), in_current=True)
     (found,) = find_faults(position, current, RATE_HZ)
