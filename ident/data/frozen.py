@@ -1,10 +1,10 @@
 """Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
 
 A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only stops from one sample
-to the next is none: a robot may run into something, and a simple device may know no acceleration. One that never goes on
-is frozen where every other stop and turn of its motor was far gentler, and the other motors still move. A position at the
-end of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise while
-its motor moves.
+to the next is none: a robot may run into something, and a simple device may know no acceleration. One that never goes
+on is frozen where every other stop and turn of its motor was far gentler, and the other motors still move. A position
+at the end of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise
+while its motor moves.
 """
 
 from __future__ import annotations
