@@ -25,7 +25,7 @@ help:
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
-	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
+	@echo "make bench   speed and memory: against figaroh 1.0.2 and loops over Pinocchio in Python and C++, growth to 4 million samples, a whole fit; minutes"
 	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/evidence/stream.md); minutes"
 	@echo "make ident-study  errors by estimator and noise floor (docs/evidence/estimators.md); half an hour"
 	@echo "make tls-study  total least squares beside maximum likelihood, without and with an undeclared effect (docs/evidence/estimators.md); minutes"
@@ -99,7 +99,7 @@ test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes"
 
 test-processes: setup
-	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs tests/faults
+	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs tests/faults tests/bench
 
 test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \

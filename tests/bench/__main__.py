@@ -1,5 +1,5 @@
-"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, start-up,
-reading logs, and a fleet.
+"""`make bench`: speed and memory against figaroh and loops over Pinocchio, growth to 4 million samples, a whole fit,
+start-up, reading logs, and a fleet.
 
 Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
 Each job runs in a child process of its own, and this one stays small: Linux counts what a parent holds to the peak of
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench.compiled import NotCompiled, compiled
 from tests.bench.fleet import summary_text as fleet_text
 from tests.bench.log_reading import summary_text
 from tests.bench.start_up import start_up
@@ -44,9 +45,12 @@ def main() -> int:
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="samples, of the growth")
     parser.add_argument("--hour", type=int, default=3600, help="seconds of the long log that is read")
     parser.add_argument("--cells", type=int, default=200, help="of the fleet")
+    parser.add_argument("--only-comparison", action="store_true", help="with figaroh and Pinocchio; nothing else")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     comparison = _comparison(arguments.repeats)
+    if arguments.only_comparison:
+        return 0
     growth = _growth(tuple(size for size in SIZES if size <= arguments.largest))
     whole_fit = _whole_fit(arguments.repeats)
     start = start_up(OUT, OUT / f"{LOGS[0]}.mcap", arguments.repeats, ENVIRONMENT)
@@ -75,34 +79,61 @@ def _comparison(repeats: int) -> dict[str, Any]:
     make = [sys.executable, "-m", "tests.bench.synthetic", str(URDF), str(SAMPLES), str(data)]
     subprocess.run(make, env=ENVIRONMENT, check=True)
     predicted = {"ours": OUT / "predicted-ours.npy", "figaroh": OUT / "predicted-figaroh.npy"}
+    ours = [sys.executable, "-m", "tests.bench.our_fit", str(data), str(URDF), str(predicted["ours"])]
+    figaroh = [str(python), "tests/bench/figaroh_fit.py", str(data), str(URDF), str(predicted["figaroh"])]
     commands = {
-        "ours": [sys.executable, "-m", "tests.bench.our_fit"],
-        "figaroh": [str(python), "tests/bench/figaroh_fit.py"],
+        "ours": ours,
+        "figaroh": figaroh,
+        "Pinocchio in Python": [sys.executable, "-m", "tests.bench.pinocchio_fit", str(data), str(URDF)],
     }
-    found = {
-        name: _json_of([*command, str(data), str(URDF), str(predicted[name]), str(repeats)])
-        for name, command in commands.items()
-    }
-    ours, theirs = (np.load(predicted[name]) for name in ("ours", "figaroh"))
-    difference = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs)))
+    compiled_command = _compiled(data)
+    if compiled_command is not None:
+        commands["Pinocchio in C++"] = compiled_command
+    found = {name: _json_of([*command, str(repeats)]) for name, command in commands.items()}
+    our_torque, their_torque = (np.load(predicted[name]) for name in ("ours", "figaroh"))
+    difference = float(np.max(np.abs(our_torque - their_torque)) / np.max(np.abs(their_torque)))
     _print_line(
-        "\n| | processor time s, median (all) | base parameters | residual norm Nm | peak MB |\n|---|---|---|---|---|"
+        "\n| | processor time s, median (all) | ratio | base parameters | residual norm Nm | peak MB |\n"
+        "|---|---|---|---|---|---|"
     )
     for name, figures in found.items():
         totals = [run["total"] for run in figures["seconds"]]
         figures["median_seconds"] = statistics.median(totals)
+        figures["ratio"] = figures["median_seconds"] / found["ours"]["median_seconds"]
+        all_totals = ", ".join(f"{total:.3f}" for total in totals)
         _print_line(
-            f"| {name} | {figures['median_seconds']:.3f} ({', '.join(f'{total:.3f}' for total in totals)}) "
+            f"| {name} | {figures['median_seconds']:.3f} ({all_totals}) | {figures['ratio']:.2f} "
             f"| {figures['base_parameters']} | {figures['residual_norm_nm']:.9g} | {figures['peak_mb']:.0f} |"
         )
-    ratio = found["figaroh"]["median_seconds"] / found["ours"]["median_seconds"]
-    _print_line(f"ratio {ratio:.1f}; predicted torques differ by {difference:.1e} of the largest")
-    bare_qr = statistics.median(found["ours"]["bare_qr_seconds"])
-    _print_line(
-        f"LAPACK's QR (dgeqrf) of the same columns of each joint: {bare_qr:.3f} s; "
-        f"the whole of ours is {found['ours']['median_seconds'] / bare_qr:.2f} times that"
-    )
-    return {"samples": SAMPLES, **found, "ratio": ratio, "largest_relative_difference": difference}
+    _print_line(f"predicted torques differ from figaroh's by {difference:.1e} of the largest")
+    for key, which in (("bare_qr_seconds", "that ours reduces"), ("standard_qr_seconds", "of all standard parameters")):
+        bare_qr = statistics.median(found["ours"][key])
+        _print_line(
+            f"LAPACK's QR (dgeqrf) of each joint's columns {which}, rows already built: {bare_qr:.3f} s; "
+            f"the whole of ours is {found['ours']['median_seconds'] / bare_qr:.2f} times that"
+        )
+    return {
+        "samples": SAMPLES,
+        **found,
+        "ratio": found["figaroh"]["ratio"],
+        "largest_relative_difference": difference,
+    }
+
+
+def _compiled(data: Path) -> list[str] | None:
+    """Command of the compiled program without the repeats; None without a compiler, and it is said."""
+    folder = OUT / "compiled"
+    folder.mkdir(parents=True, exist_ok=True)
+    _print_line("compiling Pinocchio's regressor and LAPACK's QR in C++ (a minute)")
+    try:
+        program = compiled(folder)
+    except NotCompiled as error:
+        _print_line(f"without C++: {error}")
+        return None
+    measurements, joints = folder / "measurements.bin", folder / "joints.txt"
+    write = [sys.executable, "-m", "tests.bench.compiled_inputs", str(data), str(URDF), str(measurements), str(joints)]
+    subprocess.run(write, check=True)
+    return [str(program), str(measurements), str(joints)]
 
 
 def _growth(sizes: tuple[int, ...]) -> list[dict[str, Any]]:

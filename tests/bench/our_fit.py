@@ -6,7 +6,6 @@ python -m tests.bench.our_fit DATA.npz ROBOT.urdf PREDICTED.npy REPEATS     prin
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from scipy.linalg import lapack
 
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
+from tests.bench.memory import peak_mb
 from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, joint_columns, standard_rows
 
 FloatArray = NDArray[np.float64]
@@ -50,9 +50,11 @@ def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
         begin = time.process_time()
         fit = fit_torques(robot, _pieces(data))
         seconds.append({"total": time.process_time() - begin})
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    largest_mb = peak_mb()
     columns = joint_columns(robot, _pieces(data))
     bare_qr = [_bare_qr_s(columns) for _ in range(int(repeats))]
+    standard = joint_columns(robot, _pieces(data), all_standard=True)
+    standard_qr = [_bare_qr_s(standard) for _ in range(int(repeats))]
     predicted = []
     for motion, torque in _pieces(data):
         room = standard_rows(robot, torque.shape[1])
@@ -63,8 +65,9 @@ def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
         "seconds": seconds,
         "base_parameters": len(fit.values),
         "residual_norm_nm": fit.residual_norm,
-        "peak_mb": peak_mb,
+        "peak_mb": largest_mb,
         "bare_qr_seconds": bare_qr,
+        "standard_qr_seconds": standard_qr,
     }
     sys.stdout.write(json.dumps(found) + "\n")
 

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import pinocchio
 import pytest
 
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
+from tests.bench import compiled_inputs, pinocchio_fit, synthetic
+from tests.bench.compiled import NotCompiled, compiled
 from tests.bench.motion import RATE_HZ, sinusoids
 from tests.bench.synthetic import NOISE_NM, measurements
 from tests.bench.torque_fit import fill_rows, fit_torques, names, standard_rows
 from tests.ident.arms import ARMS, TX40, Arm
+
+TX40_URDF = Path("configs/robots/tx40.urdf")
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
@@ -42,6 +52,46 @@ def test_a_course_does_not_depend_on_its_pieces() -> None:
     assert [len(piece.position_rad) for piece in pieces] == [300, 300, 300, 100]
     joined = np.concatenate([piece.acceleration_rad_s2 for piece in pieces])
     assert np.array_equal(joined, course.motion(np.arange(1000) / RATE_HZ).acceleration_rad_s2)
+
+
+def written(folder: Path) -> Path:
+    """Measurements of the TX-40 as a file."""
+    path = folder / "measurements.npz"
+    synthetic.main(str(TX40_URDF), "6000", str(path))
+    return path
+
+
+def of_program(command: list[str]) -> dict[str, Any]:
+    """What one of the timed programs prints."""
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout))
+
+
+def test_the_loop_over_pinocchio_finds_the_same(tmp_path: Path) -> None:
+    robot = robot_from_urdf(TX40_URDF.read_text())
+    fit = fit_torques(robot, measurements(robot, 6000))
+    data = dict(np.load(written(tmp_path)))
+    parameters, residual_norm_nm = pinocchio_fit.fit(pinocchio.buildModelFromUrdf(str(TX40_URDF)), data)
+    assert parameters == len(fit.values)
+    assert residual_norm_nm == pytest.approx(fit.residual_norm, rel=1e-9)
+
+
+@pytest.mark.processes
+def test_the_compiled_program_finds_the_same(tmp_path: Path) -> None:
+    robot = robot_from_urdf(TX40_URDF.read_text())
+    fit = fit_torques(robot, measurements(robot, 6000))
+    data = written(tmp_path)
+    inputs = tmp_path / "measurements.bin", tmp_path / "joints.txt"
+    compiled_inputs.main(str(data), str(TX40_URDF), str(inputs[0]), str(inputs[1]))
+    folder = Path("out/bench/compiled")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        program = compiled(folder)
+    except NotCompiled as error:
+        pytest.skip(str(error))
+    found = of_program([str(program), str(inputs[0]), str(inputs[1]), "1"])
+    assert found["base_parameters"] == len(fit.values)
+    assert found["residual_norm_nm"] == pytest.approx(fit.residual_norm, rel=1e-9)
 
 
 def test_agrees_with_dense_least_squares() -> None:

@@ -121,9 +121,14 @@ def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> To
     return TorqueFit(base, np.asarray(values), float(abs(small[-1, -1])))
 
 
-def joint_columns(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> tuple[FloatArray, ...]:
-    """What `fit_torques` reduces, held whole: for each joint its columns and its torque, shape (c_j + 1, k)."""
-    needed = _needed(robot, structure(robot))
+def joint_columns(
+    robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]], *, all_standard: bool = False
+) -> tuple[FloatArray, ...]:
+    """What `fit_torques` reduces, held whole: for each joint its columns and its torque, shape (c_j + 1, k).
+
+    `all_standard` takes the columns too that others reproduce in every motion.
+    """
+    needed = np.ones((robot.joint_count, WIDTH), dtype=np.bool_) if all_standard else _needed(robot, structure(robot))
     held, parts = _held(robot, needed), []
     for motion, torque in pieces:
         room = standard_rows(robot, torque.shape[1])
