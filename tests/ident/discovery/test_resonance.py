@@ -14,8 +14,9 @@ from ident.data.dataset import Dataset
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.resonance import propose_resonances
+from ident.discovery.resonance import propose_resonances, refined_gear
 from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import columns_at
 from ident.effects.signals import fitted_signals
 from ident.effects.transmission import Backlash, Elasticity
 from ident.effects.twist import DrivenLink, Gears, spring_torque, twists
@@ -178,3 +179,21 @@ def test_the_first_order_is_the_limit_of_a_stiff_gear(small: Evidence) -> None:
     first = Elasticity().columns(slow, AXIS)[..., 100:-100]
     assert Elasticity(2e-6, 0.3).columns(slow, AXIS)[..., 100:-100] == pytest.approx(first, abs=0.01)
     assert not np.allclose(Elasticity(0.1, 0.3).columns(slow, AXIS)[..., 100:-100], first, atol=0.1)
+
+
+@pytest.mark.parametrize("held", [0, 1])
+def test_a_gap_is_refined_to_the_form_in_which_its_link_is_held_or_not(
+    quick: Evidence, small_truth: Truth, held: int
+) -> None:
+    gap = Backlash(0.0, half_gap_rad=4e-3, resonant_rad_nm=2e-4, damping_ratio=0.25)
+    planted = replace(gap, held=held, sags=1)
+
+    def torque(data: Dataset) -> FloatArray:
+        run = fitted_signals(quick.model, data, quick.training, quick.estimate)
+        return planted.half_gap_rad * columns_at(planted, run, AXIS)[:, 0]
+
+    problem = search_problem_of(bent(quick, small_truth, torque))
+    found = refined_gear(problem, gap, AXIS)
+    assert isinstance(found, Backlash)
+    assert found.held == held
+    assert found.half_gap_rad == pytest.approx(4e-3, rel=0.3)
