@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -57,11 +59,17 @@ class TimeUnit(Enum):
     MICROSECOND = "us"
     NANOSECOND = "ns"
     ISO_8601 = "iso8601"  #: Date and time with a zone: 2026-03-01T08:00:00.004+01:00
+    CLOCK = "clock"  #: Time of day, with a date before it or not, without a zone: 08:00:00.004
 
     @property
     def digits(self) -> int:
         """Decimal digits below a second: 3 for milliseconds."""
-        return {"s": 0, "ms": 3, "us": 6, "ns": 9, "iso8601": 0}[self.value]
+        return {"s": 0, "ms": 3, "us": 6, "ns": 9, "iso8601": 0, "clock": 0}[self.value]
+
+    @property
+    def is_text(self) -> bool:
+        """Whether a stamp is a text, not a number."""
+        return self in {TimeUnit.ISO_8601, TimeUnit.CLOCK}
 
     @property
     def seconds(self) -> float:
@@ -77,6 +85,8 @@ class CsvLayout:
     decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."  #: point or comma
     skip_rows: Annotated[int, Field(ge=0)] = 0  #: lines before the header
     header: bool = True  #: whether a line of names precedes the numbers
+    #: Begin of lines among the rows that are left out; before and after the rows, #, % and // are known.
+    comment: Annotated[str, Field(min_length=1, max_length=4)] | None = None
 
     @model_validator(mode="after")
     def _check_delimiter(self) -> CsvLayout:
@@ -174,6 +184,48 @@ class TimeColumn:
     largest_gap_periods: Annotated[float, Field(ge=1.5, le=100.0)] = 3.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeptPart:
+    """Part of a recording that is imported: rows of numbers, counted from 1, or seconds since the first of them."""
+
+    from_row: Annotated[int, Field(ge=1)] | None = None  #: first row
+    to_row: Annotated[int, Field(ge=1)] | None = None  #: last row
+    from_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None  #: begin
+    to_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None  #: end
+
+    @property
+    def is_by_time(self) -> bool:
+        """Whether times are stated."""
+        return self.from_s is not None or self.to_s is not None
+
+    @property
+    def is_by_row(self) -> bool:
+        """Whether rows are stated."""
+        return self.from_row is not None or self.to_row is not None
+
+    @property
+    def rows(self) -> slice:
+        """The rows, counted from 0; all of them where only times are stated."""
+        return slice((self.from_row or 1) - 1, self.to_row)
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> KeptPart:
+        if self.is_by_time and self.is_by_row:
+            raise ValueError("rows or times, not both")
+        last_row = self.to_row or sys.maxsize
+        last_s = inf if self.to_s is None else self.to_s
+        if (self.from_row or 1) > last_row or (self.from_s or 0.0) >= last_s:
+            raise ValueError("a begin before the end")
+        return self
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldoutPart:
+    """End of a recording that becomes a log of its own, for the final error of a fit."""
+
+    from_s: Annotated[float, Field(gt=0.0, le=1e9)]  #: its begin, since the first sample that is imported [s]
+
+
 class ImportDescription(StrictModel):
     """A whole import description."""
 
@@ -190,7 +242,11 @@ class ImportDescription(StrictModel):
     temperature: TemperatureColumns | None = None  #: columns of the temperature
     rate_hz: Rate | None = None  #: sampling rate [Hz]; either this or `time`
     time: TimeColumn | None = None  #: the time column, instead of a rate
+    keep: KeptPart | None = None  #: part of the recording that is imported; all of it by default
+    holdout: HoldoutPart | None = None  #: end of it that becomes a second log
     topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
+    #: Which publisher of that topic, by the number that an import names; needed if several publish the same joints.
+    publisher: Annotated[int, Field(ge=1)] | None = None
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it

@@ -7,7 +7,7 @@ without a rounding error of its own: raw = round(value / count).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
 from pathlib import Path
@@ -18,6 +18,7 @@ from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import (
     ImportDescription,
+    KeptPart,
     PositionUnit,
     ScaledColumns,
     Section,
@@ -26,7 +27,7 @@ from daq.config.import_description import (
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, TableUnfit
+from daq.errors import ConfigurationInconsistent, DaqError, TableUnfit, UsageError
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
@@ -48,10 +49,11 @@ from daq.log.plausibility import (
     check_velocity,
     in_si,
     require_changing,
+    signed_counts,
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
-from daq.log.table import Reader, Table
+from daq.log.table import ROW_MARGIN, Reader, Table, rows_at_rate
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
@@ -71,10 +73,17 @@ class Imported:
     statistics: RunStatistics  #: of the log
     timing: Timing | None  #: what the time stamps showed; None without a time column
     remarks: tuple[str, ...]  #: oddities of the files that were mended
+    holdout: RunStatistics | None = None  #: of the log of the held-out part; None without one
 
 
 def import_recording(
-    description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None
+    description: Path,
+    data: Path,
+    out: Path,
+    *,
+    software: str,
+    cell_path: Path | None = None,
+    holdout: Path | None = None,
 ) -> Imported:
     """Convert the files that a description names to a log. The same input gives the same bytes: no clock is read.
 
@@ -84,13 +93,15 @@ def import_recording(
         out: the log to write; it does not exist after an error.
         software: name and version to put into the log.
         cell_path: cell file to use instead of the description's.
+        holdout: likewise, the log of the held-out part; None where the description has none.
 
     Raises:
         ConfigurationError: description or cell are wrong, or contradict each other.
         TableUnfit, PositionImplausible: the files cannot be used.
-        UsageError, OutputFailed: the log cannot be written.
+        UsageError, OutputFailed: a log cannot be written.
     """
     wanted = load_import(description)
+    _require_name_of_holdout(wanted, holdout)
     path = cell_path or description.parent / wanted.cell
     cell = load_cell(path)
     wanted = with_columns(wanted, data, cell.axis_names)
@@ -98,10 +109,8 @@ def import_recording(
     files = _read_tables(wanted, data)
     check_sizes(wanted, cell, files)
     recorded = _recorded(wanted, cell, files)
-    kept = recorded.kept
     rate_hz = recorded.used.rate_hz
     digests = {name: file.digest for name, file in files.items()}
-    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
     started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
     run = RunInfo(
         run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
@@ -114,19 +123,103 @@ def import_recording(
         origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
         timing=timing,
     )
-    content = LogContent.of(cell, run, bundle(path), kept.readback)
-    # A crash of an import loses no sample, so no clock is needed to flush in time.
-    with LogWriter(out, content, kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
-        stamp_ns = (started_ns + np.rint(np.arange(len(kept.counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
-        silent = (0,) * len(cell.axes)
-        rows = zip(stamp_ns, kept.counts.tolist(), kept.current_raw.tolist(), strict=True)
-        for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
-            log.readings(_readings(slow, cycle, time_ns))
-            log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
-        log.conclude(valid=True)
+    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
+    samples = _LogSamples(cell, bundle(path), recorded.kept, slow, run, started_ns)
+    rows = range(len(recorded.kept.counts))
+    of_holdout = None
+    if wanted.holdout is None or holdout is None:
+        statistics = samples.write(out, rows)
+    else:
+        first = _first_of_holdout(wanted, wanted.holdout.from_s, rate_hz, len(rows))
+        of_holdout = samples.write(holdout, rows[first:])
+        try:
+            statistics = samples.write(out, rows[:first])
+        except DaqError:
+            holdout.unlink()
+            raise
     remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks += recorded.remarks
     remarks += fault_remarks(recorded.faults, recorded.used)
-    return Imported(log.statistics, timing, tuple(remarks))
+    return Imported(statistics, timing, tuple(remarks), of_holdout)
+
+
+def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) -> None:
+    """Refuse a description with a held-out part that has no name, and a name without such a part."""
+    if (wanted.holdout is None) == (holdout is None):
+        return
+    raise UsageError(
+        f"import description {wanted.name!r}",
+        found="`holdout`, and no name for the log of that part" if holdout is None else "no `holdout`",
+        expected="a name for the second log" if holdout is None else "`holdout: {from_s: SECONDS}`, the begin of it",
+        remedy="give `--holdout FILE`" if holdout is None else f"add it to the description, or leave out {holdout}",
+    )
+
+
+def _first_of_holdout(wanted: ImportDescription, from_s: float, rate_hz: float, count: int) -> int:
+    """Return the first sample of the held-out part.
+
+    Raises:
+        TableUnfit: one of the parts has too few samples.
+    """
+    first = ceil(from_s * rate_hz - ROW_MARGIN)
+    if FEWEST_ROWS <= first <= count - FEWEST_ROWS:
+        return first
+    raise TableUnfit(
+        f"import description {wanted.name!r}: holdout.from_s",
+        found=f"{from_s:g} s, of {count / rate_hz:.6g} s that are imported",
+        expected="a time in the recording, since its first sample",
+        remedy="correct `holdout`",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LogSamples:
+    """Samples of a recording, all of which or a part go into a log."""
+
+    cell: Cell
+    files: Mapping[str, bytes]  #: the cell's bundle
+    kept: Converted
+    slow: list[tuple[Quantity, int, FloatArray]]
+    run: RunInfo
+    started_ns: int
+
+    def write(self, out: Path, rows: range) -> RunStatistics:
+        """Write some samples into a new log.
+
+        Raises:
+            UsageError, OutputFailed: the log cannot be written.
+        """
+        step_ns = 1e9 / self.run.rate_hz
+        content = LogContent.of(self.cell, self._run_of(rows), self.files, self.kept.readback)
+        # A crash of an import loses no sample, so no clock is needed to flush in time.
+        with LogWriter(out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+            silent = (0,) * len(self.cell.axes)
+            counts = self.kept.counts[rows.start : rows.stop].tolist()
+            current_raw = self.kept.current_raw[rows.start : rows.stop].tolist()
+            for cycle, row in enumerate(rows):
+                time_ns = self.started_ns + round(row * step_ns)
+                log.readings(_readings(self.slow, row, time_ns))
+                log.write(Sample(cycle, time_ns, tuple(counts[cycle]), tuple(current_raw[cycle]), silent))
+            log.conclude(valid=True)
+        return log.statistics
+
+    def _run_of(self, rows: range) -> RunInfo:
+        """Return the facts about a part of the recording."""
+        if len(rows) == len(self.kept.counts):
+            return self.run
+        later_ns = round(rows.start * 1e9 / self.run.rate_hz)
+        wall_ns = self.run.started_wall_ns + later_ns if self.run.started_wall_ns else 0
+        timing = self.run.timing
+        if timing is not None and timing.started_s is not None:
+            timing = replace(timing, started_s=timing.started_s + later_ns * 1e-9)
+        return replace(
+            self.run,
+            run_id=f"{self.run.run_id}-{rows.start}-{rows.stop}",
+            started_wall_ns=wall_ns,
+            started_monotonic_ns=wall_ns,
+            origin=f"{self.run.origin}, samples {rows.start + 1} to {rows.stop}",
+            timing=timing,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +241,7 @@ class JudgedRecording:
     clock: Clock | None  #: None without a time column
     kept: Converted  #: what the log is to hold
     faults: tuple[ChannelFault, ...]  #: readings that are none
+    remarks: tuple[str, ...]  #: on what was mended besides
 
 
 def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> JudgedRecording:
@@ -161,7 +255,9 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     position = table.take(wanted.position.columns)
     current = currents.take(wanted.current.columns)
     require_changing(position, current, wanted, currents)
+    remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
+        position, remarks = signed_counts(position, wanted)
         check_counts(position, wanted, table)
     clock = None
     rate_hz = wanted.rate_hz
@@ -189,7 +285,7 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     if sound.faults and is_resampled:
         # Where rows stay as they are, a fit mends them; a spline would spread what is wrong.
         kept = _converted(wanted, cell, sound.position[row], sound.current, clock)
-    return JudgedRecording(used, clock, kept, sound.faults)
+    return JudgedRecording(used, clock, kept, sound.faults, remarks)
 
 
 def _converted(
@@ -213,10 +309,21 @@ def _converted(
 
 def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     """Read every file of the description with the reader of its kind."""
-    tables = {}
-    for name, columns in wanted.files().items():
+    part = wanted.keep
+    if part is not None and part.is_by_time and wanted.rate_hz is not None:
+        wanted = wanted.model_copy(update={"keep": _part_of_rows(rows_at_rate(wanted.rate_hz, part))})
+    read: dict[str, Table] = {}
+    # The file with the stamps comes first: where times are kept, it says which rows of the others these are.
+    files = wanted.files()
+    for name in sorted(files, key=lambda one: wanted.time is None or one != wanted.time.file):
         time = wanted.time if wanted.time is not None and wanted.time.file == name else None
-        tables[name] = reader_of(data / name)(data / name, wanted, columns, time)
+        path = data / name
+        table = reader_of(path)(path, wanted, files[name], time)
+        read[name] = table
+        if time is not None and part is not None and part.is_by_time:
+            rows = slice(table.first_row, table.first_row + len(table.values))
+            wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
+    tables = {name: read[name] for name in files}
     if len({len(file.values) for file in tables.values()}) > 1:
         raise TableUnfit(
             ", ".join(str(file.path) for file in tables.values()),
@@ -233,6 +340,11 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             remedy="was the export interrupted? export the recording again",
         )
     return tables
+
+
+def _part_of_rows(rows: slice) -> KeptPart:
+    """Return the part of a recording that has these rows, counted from 0."""
+    return KeptPart(from_row=rows.start + 1, to_row=rows.stop)
 
 
 def _slow(

@@ -134,6 +134,7 @@ class JointState:
     """A message of the type sensor_msgs/msg/JointState; a field without values is empty."""
 
     stamp_ns: int  #: of its header
+    frame: str  #: of its header
     names: tuple[str, ...]  #: names of n joints
     position: tuple[float, ...]  #: [rad; m for a prismatic joint], shape (n,)
     velocity: tuple[float, ...]  #: per second, shape (n,)
@@ -177,12 +178,12 @@ def joint_state_from_cdr(data: bytes) -> JointState:
 
     try:
         seconds, nanoseconds = struct.unpack_from(order + "iI", body)
-        text()  # the frame
+        frame = text()
         count = unsigned()
         if count > len(body):
             raise ValueError(f"{count} names in {len(body)} bytes")
         names = tuple([text() for _ in range(count)])
-        return JointState(seconds * 1_000_000_000 + nanoseconds, names, numbers(), numbers(), numbers())
+        return JointState(seconds * 1_000_000_000 + nanoseconds, frame, names, numbers(), numbers(), numbers())
     except struct.error as error:
         raise ValueError(f"a message of {len(data)} bytes ({error})") from error
 

@@ -34,6 +34,7 @@ from ident.errors import CurrentUnsigned
 
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
+LARGEST_UNSIGNED = 2**32 - 1
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
@@ -75,6 +76,27 @@ def check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -
             expected="a whole number of encoder counts of at most 31 bits",
             remedy="correct `unit` in the import description",
         )
+
+
+def signed_counts(position: FloatArray, wanted: ImportDescription) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return counts with a sign where a column has them of 32 bits without: the same counter, read as a drive does.
+
+    Args:
+        position: as the file has it, shape (rows, n).
+        wanted: with the columns of the positions.
+
+    Returns:
+        position, shape (rows, n), and a remark for each column that was changed.
+    """
+    signed = position.copy()
+    remarks = []
+    for index, column in enumerate(wanted.position.columns):
+        counts = position[:, index]
+        is_unsigned = counts.min() >= 0.0 and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
+        if is_unsigned:
+            signed[counts > LARGEST_RAW, index] -= LARGEST_UNSIGNED + 1.0
+            remarks.append(f"column {column}: counts of 32 bits without a sign, read as counts with one")
+    return signed, tuple(remarks)
 
 
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
@@ -148,7 +170,8 @@ def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -
     found = impossible_current(current)
     if found is not None:
         place = file.place(found.row, wanted.current.columns[found.axis])
-        raise found.error(TableUnfit, place, "samples are never invented: cut the recording there, or export it again")
+        remedy = "samples are never invented: cut the recording there, by `keep`, or export it again"
+        raise found.error(TableUnfit, place, remedy)
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
@@ -192,8 +215,9 @@ def check_steps(
     raise found.error(
         TableUnfit,
         f"{file.place(row, wanted.position.columns[found.axis])}, axis {cell.axes[found.axis].name}",
-        "cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
-        "the motor, as a counter) has to be made continuous",
+        "cut the recording there, by `keep` of the import description, or export it again; a column that wraps (at 360 "
+        "degrees, at a turn of the motor, as a counter) has to be made continuous; in a bag, do two nodes publish the "
+        "same joints on the topic?",
     )
 
 

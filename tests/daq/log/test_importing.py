@@ -30,6 +30,7 @@ from daq.report.document import json_tree
 from daq.report.log import info_report
 from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
+from tests.studies.real_runs import ur10
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 NAMES = [f"q{i}" for i in range(1, 7)] + [f"i{i}" for i in range(1, 7)]
@@ -582,6 +583,25 @@ def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.Capture
     np.testing.assert_allclose(run.position_rad[:, 0], joint_rad[:, 0], atol=1e-8)
 
 
+def test_counts_without_a_sign_are_those_with_one(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """A drive's counter of 32 bits that a tool reads as unsigned jumps by 2³² at zero; one column stays above it."""
+    motor_rad = np.radians(bench.joint_deg) @ load_run_of(bench).T
+    counts = np.rint(motor_rad / (2 * pi) * 65536)
+    counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=counted)
+    bench.write_csv(np.hstack((counts, bench.current_a)))
+    assert bench.run() == 0
+    expected = load_run(bench.out)[0].position_rad
+    bench.out.unlink()
+    unsigned = np.where(counts < 0, counts + 2**32, counts)
+    assert (np.abs(np.diff(unsigned, axis=0)) > 2**31).any()
+    bench.write_csv(np.hstack((unsigned, bench.current_a)))
+    capsys.readouterr()
+    assert bench.run() == 0
+    assert "column q1: counts of 32 bits without a sign, read as counts with one" in capsys.readouterr().out
+    np.testing.assert_array_equal(load_run(bench.out)[0].position_rad, expected)
+
+
 def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
     turn, ratio = TURN_WITH_WRAPS, load_run_of(bench)
     _with_counts_that_wrap(bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))))
@@ -884,3 +904,148 @@ def test_stamps_in_another_unit_have_no_rate_of_a_robot(checkout: Path, tmp_path
     bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "s"})
     with pytest.raises(TableUnfit, match="Hz with `unit: s`"):
         import_recording(bench.description, bench.data, bench.out, software="test")
+
+
+def _two_files(bench: Bench) -> None:
+    """Positions with stamps in one file, currents in another one."""
+    stamps = 0.004 * np.arange(300)
+    with_time = np.column_stack((stamps, bench.joint_deg))
+    for name, names, values in (
+        ("position.csv", ["t", *NAMES[:6]], with_time),
+        ("current.csv", NAMES[6:], bench.current_a),
+    ):
+        lines = [",".join(names), *(",".join(map(repr, row)) for row in values.tolist())]
+        (bench.data / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
+    """0.4 to 0.8 s at 250 Hz; the files that have no stamps give the same rows."""
+    _two_files(bench)
+    bench.describe(
+        position={"file": "position.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"},
+        current={"file": "current.csv", "columns": NAMES[6:], "unit": "A"},
+        rate_hz=None,
+        time={"file": "position.csv", "column": "t", "unit": "s"},
+        keep={"from_s": 0.4, "to_s": 0.8},
+    )
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg[100:201]), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a[100:201], atol=1e-9)
+    assert run.started_s == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("keep", "rows"),
+    [
+        ({"from_row": 21}, slice(20, 300)),
+        ({"to_row": 280}, slice(0, 280)),
+        ({"from_s": 0.02, "to_s": 0.25}, slice(20, 251)),
+    ],
+)
+def test_rows_are_kept_at_a_stated_rate(bench: Bench, keep: dict[str, float], rows: slice) -> None:
+    bench.describe(keep=keep)
+    assert bench.run() == 0
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg[rows]), atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("keep", "said"),
+    [
+        ({"from_row": 5, "to_row": 4}, "a begin before the end"),
+        ({"from_s": 1.0, "to_s": 1.0}, "a begin before the end"),
+        ({"from_row": 5, "to_s": 4.0}, "rows or times, not both"),
+        ({"from_row": 0}, "greater than or equal to 1"),
+    ],
+)
+def test_a_part_that_is_none_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], keep: dict[str, float], said: str
+) -> None:
+    bench.describe(keep=keep)
+    _refused(bench, capsys, 6, said)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> None:
+    """No sample is in both, and none is lost."""
+    if timed:
+        _with_time(bench, 1_772_348_400_000.0 + 4.0 * np.arange(300))
+    part = {"from_s": 0.8 if timed else 0.2}
+    time = {"file": "run.csv", "column": "t", "unit": "ms"} if timed else None
+    bench.describe(rate_hz=None if timed else 1000, time=time, holdout=part)
+    held_out = bench.out.with_name("held-out.mcap")
+    imported = import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+    assert imported.statistics.samples == 200
+    assert imported.holdout is not None
+    assert imported.holdout.samples == 100
+    runs = [load_run(path)[0] for path in (bench.out, held_out)]
+    joined = np.vstack([run.position_rad for run in runs])
+    np.testing.assert_allclose(joined, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(np.vstack([run.current_a for run in runs]), bench.current_a, atol=1e-9)
+    if timed:
+        assert runs[1].started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
+    assert read_log(bench.out).head.run.run_id != read_log(held_out).head.run.run_id
+
+
+def test_the_command_writes_both_logs_and_reports_them(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(holdout={"from_s": 0.2})
+    held_out = bench.out.with_name("held-out.mcap")
+    command = ["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out)]
+    assert main([*command, "--holdout", str(held_out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["samples"] == 200
+    assert report["holdout"] == {"log": str(held_out), "samples": 100}
+
+
+@pytest.mark.parametrize(
+    ("part", "named", "error", "said"),
+    [
+        ({"from_s": 0.2}, False, UsageError, "give `--holdout FILE`"),
+        (None, True, UsageError, "found no `holdout`"),
+        ({"from_s": 0.3}, True, TableUnfit, "found 0.3 s, of 0.3 s that are imported"),
+        ({"from_s": 0.001}, True, TableUnfit, "found 0.001 s, of 0.3 s"),
+    ],
+)
+def test_a_held_out_part_that_is_none_is_refused(
+    bench: Bench, part: dict[str, float] | None, named: bool, error: type[Exception], said: str
+) -> None:
+    bench.describe(holdout=part)
+    held_out = bench.out.with_name("held-out.mcap") if named else None
+    with pytest.raises(error, match=said):
+        import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+    assert bench.left == []
+
+
+def test_a_log_that_cannot_be_written_leaves_no_held_out_part(bench: Bench) -> None:
+    bench.describe(holdout={"from_s": 0.2})
+    bench.out.write_bytes(b"mine")
+    with pytest.raises(UsageError):
+        import_recording(
+            bench.description, bench.data, bench.out, software="test", holdout=bench.out.with_name("held-out.mcap")
+        )
+    assert bench.left == ["run.mcap"]
+
+
+def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: Path) -> None:
+    """A ROS 2 bag in SQLite; the two logs are the parts that the studies read past the import."""
+    bag = "ur10_exciting_trajectory.db3"
+    description = tmp_path / "ur10.yaml"
+    document = {
+        "name": "ur10",
+        "cell": str(shared_data / "ur10/ur10-cell.yaml"),
+        "position": {"file": bag, "columns": ["position"], "unit": "rad", "side": "joint"},
+        "current": {"file": bag, "columns": ["effort"], "unit": "Nm"},
+        "time": {"file": bag, "column": "header.stamp", "unit": "ns"},
+        "holdout": {"from_s": 16.512},
+    }
+    description.write_text(json.dumps(document), encoding="utf-8")
+    logs = tmp_path / "fit.mcap", tmp_path / "held-out.mcap"
+    import_recording(description, shared_data / "ur10", logs[0], software="test", holdout=logs[1])
+    recording = ur10(shared_data)
+    (whole,) = recording.runs
+    (is_fit,) = recording.part_of
+    for log, part in zip(logs, (1, 0), strict=True):
+        run, _ = load_run(log)
+        assert run.rate_hz == pytest.approx(125.0)
+        np.testing.assert_allclose(run.position_rad, whole.position_rad[is_fit == part], atol=1e-8)
+        np.testing.assert_allclose(run.current_a, whole.current_a[is_fit == part], atol=1e-6)
