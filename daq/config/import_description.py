@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from math import inf
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -29,6 +29,7 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
 RATES_HZ = (1.0, 1e6)  #: Least and largest sampling rate, stated or by the stamps
 Rate = Annotated[float, Field(ge=RATES_HZ[0], le=RATES_HZ[1])]
+UnitName = Annotated[str, Field(min_length=1)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 SMALLEST_FACTOR = 1e-9
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
@@ -99,8 +100,28 @@ class CsvLayout:
 class Section:
     """Columns of a quantity, one for each axis."""
 
-    file: FileName
-    columns: SomeColumns
+    #: One file, or one for each axis; their rows belong together.
+    file: FileName | Annotated[tuple[FileName, ...], Field(min_length=1)]
+    columns: SomeColumns  #: one column of several files has the same name in each
+
+    @property
+    def places(self) -> tuple[tuple[str, Column], ...]:
+        """File and column of each axis."""
+        if isinstance(self.file, str):
+            return tuple((self.file, column) for column in self.columns)
+        columns = self.columns * len(self.file) if len(self.columns) == 1 else self.columns
+        return tuple(zip(self.file, columns, strict=True))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files, each once."""
+        return (self.file,) if isinstance(self.file, str) else tuple(dict.fromkeys(self.file))
+
+    @model_validator(mode="after")
+    def _check_files(self) -> Self:
+        if isinstance(self.file, tuple) and len(self.columns) not in {1, len(self.file)}:
+            raise ValueError("as many files as columns, or one column of the same name in each file")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +159,16 @@ class ScaledColumns(Section):
 class CurrentColumns(ScaledColumns):
     """Columns of the current-loop reference; numbers × factor are in the gains' unit."""
 
-    unit: Annotated[str, Field(min_length=1)]
+    #: One for all axes, a list in their order, or a mapping from their names, as N beside Nm.
+    unit: UnitName | Annotated[tuple[UnitName, ...], Field(min_length=1)] | dict[Name, UnitName]
+
+    def units(self, axes: Sequence[str]) -> tuple[str, ...] | None:
+        """Return the unit of each axis; None if other axes have one."""
+        if isinstance(self.unit, str):
+            return (self.unit,) * len(axes)
+        if isinstance(self.unit, dict):
+            return tuple(self.unit[axis] for axis in axes) if self.unit.keys() == set(axes) else None
+        return self.unit if len(self.unit) == len(axes) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,7 +290,8 @@ class ImportDescription(StrictModel):
         """Return the files, each with its columns of numbers; the time column is not among them."""
         columns: dict[str, dict[Column, None]] = {}
         for _, section in self.sections():
-            columns.setdefault(section.file, {}).update(dict.fromkeys(section.columns))
+            for file, column in section.places:
+                columns.setdefault(file, {})[column] = None
         if self.time is not None:
             columns.setdefault(self.time.file, {})
         return {file: tuple(found) for file, found in columns.items()}
@@ -282,15 +313,16 @@ def load_import(path: Path) -> ImportDescription:
     if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
         expected = "motor; counts are of the motor encoder"
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
-    axes = len(wanted.position.columns)
+    axes = len(wanted.position.places)
     for name, section in wanted.sections():
         factors = section.stated_factors if isinstance(section, ScaledColumns) else ()
         if any(abs(one) < SMALLEST_FACTOR for one in factors):
             expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
         # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import counts.
-        if len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
-            found = f"{len(section.columns)} columns"
+        own = len(section.places)
+        if own != axes and 1 not in {axes, own}:
+            found = f"{own} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
     timed = () if wanted.time is None else (wanted.time.column,)
     named = [c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, CsvLayout, ImportDescription, PositionUnit, TimeColumn
+from daq.config.import_description import Column, CsvLayout, ImportDescription, PositionUnit, Section, TimeColumn
 from daq.errors import TableUnfit, counted
 from daq.files import read_regular
 from daq.log.table import unreadable
@@ -375,23 +375,29 @@ def _check_units(
     def is_here(name: str) -> bool:
         return Path(name).parts == file.path.parts[-len(Path(name).parts) :]
 
+    def columns_here(section: Section) -> list[tuple[int, Column]]:
+        """Number and column of each axis whose numbers are in this file."""
+        return [(axis, column) for axis, (name, column) in enumerate(section.places) if is_here(name)]
+
     position = wanted.position
-    if is_here(position.file) and position.unit is not PositionUnit.COUNTS:
-        for column in position.columns:
-            check("position", column, POSITION_UNITS, position.unit.value, TURNING_OR_NOT[position.unit.value])
+    unit = position.unit.value
+    if position.unit is not PositionUnit.COUNTS:
+        for _, column in columns_here(position):
+            check("position", column, POSITION_UNITS, unit, TURNING_OR_NOT[unit])
     velocity = wanted.velocity
-    if velocity is not None and is_here(velocity.file):
+    if velocity is not None:
         unit = velocity.unit.value
         allowed = {f"{one}/s" for one in TURNING_OR_NOT[unit.removesuffix("/s")]}
-        for column in velocity.columns:
+        for _, column in columns_here(velocity):
             check("velocity", column, VELOCITY_UNITS, unit, allowed)
     if time is not None and not time.unit.is_text:
         check("time", time.column, TIME_UNITS, time.unit.value, {time.unit.value})
     current = wanted.current
-    if is_here(current.file) and set(map(abs, current.stated_factors)) == {1.0}:
-        thousandth = f"m{current.unit}"
-        for column in current.columns:
-            check("current", column, {thousandth: thousandth}, current.unit, {current.unit})
+    units = current.units([str(column) for _, column in current.places])
+    if units is not None and set(map(abs, current.stated_factors)) == {1.0}:
+        for axis, column in columns_here(current):
+            thousandth = f"m{units[axis]}"
+            check("current", column, {thousandth: thousandth}, units[axis], {units[axis]})
 
 
 def _decoded(path: Path, data: bytes) -> tuple[str, ...]:

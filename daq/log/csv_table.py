@@ -56,9 +56,12 @@ def read_csv(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
             require_kept(path, len(lines.rows), rows)
             lines = lines.part(rows)
             stamps = cut_stamps(stamps, rows)
+    beside = None
+    if time is None and wanted.time is not None and lines.names.count(str(wanted.time.column)) == 1:
+        beside, _ = _stamps_of(lines, wanted.time)
     values = _numbers(lines, columns)
     digest = sha256("\n".join(lines.rows).encode())
-    return Table(path, columns, values, digest, stamps, lines.numbers, lines.first_row, remarks)
+    return Table(path, columns, values, digest, stamps, lines.numbers, lines.first_row, remarks, beside)
 
 
 def _stamps_of(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...]]:

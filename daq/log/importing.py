@@ -17,6 +17,7 @@ import numpy as np
 from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import (
+    Column,
     ImportDescription,
     KeptPart,
     PositionUnit,
@@ -53,7 +54,7 @@ from daq.log.plausibility import (
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
-from daq.log.table import ROW_MARGIN, Reader, Table, rows_at_rate
+from daq.log.table import ROW_MARGIN, Reader, Table, compare_stamps, rows_at_rate, section_values
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
@@ -250,15 +251,14 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     Raises:
         TableUnfit, PositionImplausible: the files cannot be used.
     """
-    table = files[wanted.position.file]
-    currents = files[wanted.current.file]
-    position = table.take(wanted.position.columns)
-    current = currents.take(wanted.current.columns)
-    require_changing(position, current, wanted, currents)
+    table = files[wanted.position.files[0]]
+    position = section_values(wanted.position, files)
+    current = section_values(wanted.current, files)
+    require_changing(position, current, wanted, files)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
         position, remarks = signed_counts(position, wanted)
-        check_counts(position, wanted, table)
+        check_counts(position, wanted, files)
     clock = None
     rate_hz = wanted.rate_hz
     row = np.arange(len(position))
@@ -269,15 +269,16 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
         row = clock.row
     assert rate_hz is not None  # load_import requires one of the two
     used = UsedRows(row, None if clock is None else clock.time_s, rate_hz, wanted, files, cell)
-    check_current(current, wanted, currents)
+    check_current(current, wanted, files)
     sound = sound_columns(position, current, used)
     kept = _converted(wanted, cell, position[row], current, clock)
     joint_rad = kept.joint_rad
-    check_limits(str(table.path), joint_rad, cell)
-    check_motion(str(table.path), joint_rad, cell)
-    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    subject = str(table.path) if len(wanted.position.files) == 1 else f"import description {wanted.name!r}"
+    check_limits(subject, joint_rad, cell)
+    check_motion(subject, joint_rad, cell)
+    check_steps(wanted, files, joint_rad, rate_hz, clock, cell)
     require_mendable(sound.faults, used, displaced=True)
-    check_speed(str(table.path), joint_rad, rate_hz, cell)
+    check_speed(subject, joint_rad, rate_hz, cell)
     check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
     current_a = kept.current_raw * kept.scale.current_per_unit
     warn_of_unsigned(wanted.name, joint_rad, current_a, rate_hz, cell)
@@ -331,7 +332,11 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
-    position = tables[wanted.position.file]
+    if wanted.time is not None:
+        timed = tables[wanted.time.file]
+        for name, table in tables.items():
+            tables[name] = replace(table, remarks=(*table.remarks, *compare_stamps(timed, table)))
+    position = tables[wanted.position.files[0]]
     if len(position.values) < FEWEST_ROWS:
         raise TableUnfit(
             str(position.path),
@@ -354,12 +359,12 @@ def _slow(
     found = []
     if (torque := wanted.torque) is not None:
         factors = np.array(torque.factors(cell.axis_names))
-        values = on_clock(files[torque.file].take(torque.columns), clock) * factors
+        values = on_clock(section_values(torque, files), clock) * factors
         if torque.side is Side.JOINT:
             values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
         found.append((Quantity.TORQUE, max(1, round(rate_hz / TORQUE_HZ)), values))
     if (temperature := wanted.temperature) is not None:
-        values = on_clock(files[temperature.file].take(temperature.columns), clock)
+        values = on_clock(section_values(temperature, files), clock)
         found.append((Quantity.TEMPERATURE, max(1, round(rate_hz / TEMPERATURE_HZ)), values))
     return found
 
@@ -442,7 +447,8 @@ def _check_columns(wanted: ImportDescription, description: Path) -> None:
     read: dict[tuple[Path, str], str] = {}
     timed = [] if wanted.time is None else [("time.column", wanted.time.file, wanted.time.column)]
     for key, section in wanted.sections():
-        timed += [(f"{key}.columns[{index}]", section.file, column) for index, column in enumerate(section.columns)]
+        places = enumerate(section.places)
+        timed += [(f"{key}.columns[{index}]", file, column) for index, (file, column) in places]
     for key, file, column in timed:
         first = read.setdefault((Path(file), str(column)), key)
         if first != key:
@@ -458,10 +464,10 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     n = len(cell.axes)
     _check_columns(wanted, description)
     for key, section in wanted.sections():
-        if len(section.columns) != n:
+        if len(section.places) != n:
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",
-                found=f"{len(section.columns)} columns",
+                found=f"{len(section.places)} columns",
                 expected=f"{n}, one for each axis of cell {cell.name!r}",
                 remedy="correct the description, or choose the cell with --cell",
             )
@@ -472,11 +478,19 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 expected=f"one for each of {', '.join(cell.axis_names)}",
                 remedy="write a number for all axes, a list in their order, or a mapping from their names",
             )
-    for axis in cell.axes:
-        if axis.gain_unit not in {f"Nm/{wanted.current.unit}", f"N/{wanted.current.unit}"}:
+    units = wanted.current.units(cell.axis_names)
+    if units is None:
+        raise ConfigurationInconsistent(
+            f"{description}: current.unit",
+            found=str(wanted.current.unit),
+            expected=f"one for each of {', '.join(cell.axis_names)}",
+            remedy="write a unit for all axes, a list in their order, or a mapping from their names",
+        )
+    for axis, unit in zip(cell.axes, units, strict=True):
+        if axis.gain_unit not in {f"Nm/{unit}", f"N/{unit}"}:
             raise ConfigurationInconsistent(
                 f"{description}: current.unit",
-                found=f"{wanted.current.unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
+                found=f"{unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
                 expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
@@ -498,6 +512,13 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 remedy="correct the unit; convert the columns of the file to it",
             )
     _payload(wanted, cell)
+
+
+def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:
+    """Return file and column, of a bag file and field."""
+    file, column = place
+    name = str(column)
+    return Path(file), name.partition(".")[0] if file in bags else name
 
 
 _HEADS: dict[bytes, Reader] = {
@@ -544,43 +565,59 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
     changed: dict[str, Section] = {}
     bags = set[str]()
     for key, section in wanted.sections():
-        reader = reader_of(data / section.file)
-        if reader is read_bag:
-            if isinstance(section, TemperatureColumns):
-                raise TableUnfit(
-                    str(data / section.file),
-                    found="`temperature` from a ROS 2 bag",
-                    expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
-                    remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
-                )
-            bags.add(section.file)
-            field = key if key in FIELDS else "effort"
-            names = [str(column) for column in section.columns]
-            if len(names) == 1 and names[0] in FIELDS:
-                names = [f"{names[0]}.{axis}" for axis in axis_names]
-            columns = [name if name.partition(".")[0] in FIELDS else f"{field}.{name}" for name in names]
-            changed[key] = replace(section, columns=tuple(columns))
-        elif reader is read_mat and len(section.columns) == 1 < len(axis_names):
-            columns = [f"{section.columns[0]}.{number + 1}" for number in range(len(axis_names))]
-            changed[key] = replace(section, columns=tuple(columns))
+        readers = {file: reader_of(data / file) for file in section.files}
+        bags |= {file for file, reader in readers.items() if reader is read_bag}
+        if isinstance(section, TemperatureColumns) and bags.intersection(section.files):
+            raise TableUnfit(
+                str(data / section.files[0]),
+                found="`temperature` from a ROS 2 bag",
+                expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
+                remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
+            )
+        places = section.places
+        if len(places) == 1 < len(axis_names):
+            places = _of_all_axes(places[0], readers, axis_names)
+        field = key if key in FIELDS else "effort"
+        columns = [_of_field(column, field) if file in bags else column for file, column in places]
+        files: str | tuple[str, ...] = section.file
+        if isinstance(files, tuple):
+            files = tuple(file for file, _ in places)
+        changed[key] = replace(section, file=files, columns=tuple(columns))
     whole = wanted.model_copy(update=changed)
     _check_torque(whole, bags)
     return whole
 
 
+def _of_all_axes(
+    place: tuple[str, Column], readers: Mapping[str, Reader], axis_names: Sequence[str]
+) -> tuple[tuple[str, Column], ...]:
+    """Return the place of each axis, where one column may name all of them: a field of a bag, or a matrix."""
+    file, column = place
+    if readers[file] is read_bag and column in FIELDS:
+        return tuple((file, f"{column}.{axis}") for axis in axis_names)
+    if readers[file] is read_mat:
+        return tuple((file, f"{column}.{number + 1}") for number in range(len(axis_names)))
+    return (place,)
+
+
+def _of_field(column: Column, field: str) -> str:
+    """Return the column of a bag that a joint, or a field and a joint, name."""
+    name = str(column)
+    return name if name.partition(".")[0] in FIELDS else f"{field}.{name}"
+
+
 def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
     """Refuse torques from the columns, or from the field of a bag, of the currents: their slope would be made up."""
-    torque, current = wanted.torque, wanted.current
-    if torque is None or Path(torque.file) != Path(current.file):
+    if wanted.torque is None:
         return
-    found, read = (
-        [str(column).partition(".")[0] if torque.file in bags else column for column in section.columns]
-        for section in (torque, current)
-    )
-    if shared := [str(column) for column in dict.fromkeys(found) if column in read]:
+    read = {_source(place, bags) for place in wanted.current.places}
+    shared = dict.fromkeys(place for place in wanted.torque.places if _source(place, bags) in read)
+    if shared:
+        names = dict.fromkeys(_source(place, bags)[1] for place in shared)
+        files = dict.fromkeys(file for file, _ in shared)
         raise ConfigurationInconsistent(
             f"import description {wanted.name!r}: torque.columns",
-            found=f"{', '.join(shared)} of {torque.file}, which current is read from",
+            found=f"{', '.join(names)} of {', '.join(files)}, which current is read from",
             expected="the controller's own torque, in columns (of a bag: in a field) of its own",
             remedy="name those columns, or leave `torque` out; no fit needs it",
         )

@@ -7,14 +7,14 @@ names in that file. It returns a `Table`, or raises `TableUnfit`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, inf
 from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, ImportDescription, KeptPart, TimeColumn, TimeUnit
+from daq.config.import_description import Column, ImportDescription, KeptPart, Section, TimeColumn, TimeUnit
 from daq.errors import TableUnfit, counted, reason_of
 from ident.arrays import FloatArray
 
@@ -45,6 +45,8 @@ class Table:
     line_numbers: Sequence[int] | None = None  #: line of each row, from 1; None where rows have no lines
     first_row: int = 0  #: rows of the file that were cut off before the first one
     remarks: tuple[str, ...] = ()  #: oddities of the file that were mended, for the person who imports it
+    #: Of a column that is called as the time column of another file; None without one.
+    stamps_beside: Stamps | None = None
 
     def take(self, columns: Sequence[Column]) -> FloatArray:
         """Return some of the columns, shape (k, len(columns))."""
@@ -55,6 +57,52 @@ class Table:
         if self.line_numbers is None:
             return f"{self.path}, row {self.first_row + row + 1}, column {column}"
         return f"{self.path}:{self.line_numbers[row]}, column {column}"
+
+
+def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
+    """Compare the rows of two files that both have stamps: a row of one belongs to the same row of the other.
+
+    Args:
+        timed: with the stamps that are used.
+        other: with `stamps_beside`, or without.
+
+    Returns:
+        a remark where one of them begins later.
+
+    Raises:
+        TableUnfit: the steps differ: a row is missing in one of them.
+    """
+    mine = timed.stamps
+    others = other.stamps_beside
+    if mine is None or others is None or len(mine.time_s) != len(others.time_s) or len(mine.time_s) < 2:
+        return ()
+    half_step_s = 0.5 * float(np.median(np.diff(mine.time_s)))
+    apart = np.flatnonzero(np.abs(mine.time_s - others.time_s) > half_step_s)
+    if apart.size:
+        row = int(apart[0])
+        raise TableUnfit(
+            other.place(row, "time"),
+            found=f"{others.time_s[row]:.6g} s since its first row, and {mine.time_s[row]:.6g} s in {timed.path.name}",
+            expected="rows of the same instants in both files",
+            remedy="a row is missing in one of them, or they are of different runs; export them again",
+        )
+    later_s = 1e-9 * (others.first_ns - mine.first_ns)
+    if abs(later_s) <= half_step_s:
+        return ()
+    name = other.path.name
+    return (f"{name}: its stamps begin {later_s:.6g} s after those of {timed.path.name}: rows count as simultaneous",)
+
+
+def section_values(section: Section, files: Mapping[str, Table]) -> FloatArray:
+    """Return the columns of a section, shape (k, number of axes)."""
+    columns = [files[file].take((column,)) for file, column in section.places]
+    return np.hstack(columns)
+
+
+def section_place(section: Section, files: Mapping[str, Table], row: int, axis: int) -> str:
+    """Name a number of a section in a message."""
+    file, column = section.places[axis]
+    return files[file].place(row, column)
 
 
 Reader = Callable[[Path, ImportDescription, tuple[Column, ...], TimeColumn | None], Table]

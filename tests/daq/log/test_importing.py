@@ -1049,3 +1049,91 @@ def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: 
         assert run.rate_hz == pytest.approx(125.0)
         np.testing.assert_allclose(run.position_rad, whole.position_rad[is_fit == part], atol=1e-8)
         np.testing.assert_allclose(run.current_a, whole.current_a[is_fit == part], atol=1e-6)
+
+
+def _file_of_each_axis(bench: Bench, later_s: float = 0.0) -> None:
+    """A trace of each axis, with stamps of its own, as the tool of a drive exports them."""
+    for axis in range(6):
+        stamps = 0.004 * np.arange(300) + (later_s if axis == 2 else 0.0)
+        columns = np.column_stack((stamps, bench.joint_deg[:, axis], bench.current_a[:, axis]))
+        lines = ["t,position,current", *(",".join(map(repr, row)) for row in columns.tolist())]
+        (bench.data / f"axis{axis + 1}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    files = [f"axis{axis + 1}.csv" for axis in range(6)]
+    bench.describe(
+        position={"file": files, "columns": ["position"], "unit": "deg", "side": "joint"},
+        current={"file": files, "columns": ["current"] * 6, "unit": "A"},
+        rate_hz=None,
+        time={"file": "axis1.csv", "column": "t", "unit": "s"},
+    )
+
+
+def test_axes_come_from_a_file_each(bench: Bench) -> None:
+    _file_of_each_axis(bench)
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
+
+
+def test_an_error_names_the_file_of_its_axis(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _file_of_each_axis(bench)
+    path = bench.data / "axis4.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    good = lines[41]
+    lines[41] = ",".join((*good.split(",")[:2], "1e9"))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "axis4.csv:42, column current")
+    lines[41] = ",".join((good.split(",")[0], "5000.0", "0.1"))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "import description 'run', axis J4")
+
+
+def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """A row that one file lacks would shift its axis; a clock that begins elsewhere is said."""
+    _file_of_each_axis(bench, later_s=0.1)
+    assert bench.run() == 0
+    assert "axis3.csv: its stamps begin 0.1 s after those of axis1.csv" in capsys.readouterr().out
+    bench.out.unlink()
+    path = bench.data / "axis3.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([*lines[:50], *lines[51:], "1.3,0.0,0.0"]) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "axis3.csv:51, column time", "rows of the same instants in both files")
+
+
+@pytest.mark.parametrize(
+    ("files", "columns", "said"),
+    [
+        (["axis1.csv", "axis2.csv"], ["position"], "2 columns"),
+        (["axis1.csv", "axis2.csv"], ["position"] * 3, "as many files as columns"),
+    ],
+)
+def test_files_and_columns_that_do_not_match_are_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], files: list[str], columns: list[str], said: str
+) -> None:
+    _file_of_each_axis(bench)
+    bench.describe(current={"file": files, "columns": columns, "unit": "A"})
+    _refused(bench, capsys, 6, said)
+
+
+@pytest.mark.parametrize("kind", ["mapping", "list"])
+def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) -> None:
+    """As N of a prismatic axis beside Nm of the others."""
+    cell = bench.folder / "configs/cells/demo.yaml"
+    text = cell.read_text(encoding="utf-8")
+    assert text.count("nameplate_gain_nm_per_a:") == 6
+    first, *rest = re.split("nameplate_gain_nm_per_a:(.*)", text)
+    for axis, gain in enumerate(rest[::2]):
+        unit = "Nm/N" if axis == 1 else "Nm/Nm"
+        first += f'nameplate_gain: {gain.strip()}\n    gain_unit: "{unit}"' + rest[2 * axis + 1]
+    cell.write_text(first, encoding="utf-8")
+    units = {f"J{axis + 1}": "N" if axis == 1 else "Nm" for axis in range(6)}
+    stated: object = units if kind == "mapping" else list(units.values())
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": stated})
+    assert bench.run() == 0
+    assert [axis.gain_unit for axis in load_run(bench.out)[1].axes][:3] == ["Nm/Nm", "Nm/N", "Nm/Nm"]
+
+
+@pytest.mark.parametrize("unit", ["Nm", ["Nm"] * 5, {"J1": "Nm"}])
+def test_units_of_other_axes_are_refused(bench: Bench, capsys: pytest.CaptureFixture[str], unit: object) -> None:
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": unit})
+    _refused(bench, capsys, 6, "current.unit")
