@@ -109,7 +109,7 @@ def import_files(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Convert CSV files, MATLAB files or ROS 2 bags of another controller to a log, or to two, one held out."""
+    """Convert CSV files, MATLAB files or ROS bags of another controller to a log, or to two, one held out."""
     from daq.log.importing import import_recording
     from daq.report.log import import_report, timing_text
 

@@ -1,4 +1,4 @@
-"""Read joint states from ROS 2 bags as tables.
+"""Read joint states from ROS bags as tables.
 
 A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
 stamp that hold different joints make one row, because several publishers may share a topic. Several that publish the
@@ -33,7 +33,7 @@ from ident.arrays import BoolArray
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
-PATTERNS = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")  #: Files of a bag in its folder
+PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")  #: Files of a bag in its folder
 
 
 def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
@@ -56,7 +56,8 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
                 topics[topic.name] = chosen
                 if chosen:
                     try:
-                        rows.add(joint_state_from_cdr(unpack_message(message.data)), message.time_ns)
+                        state = joint_state_from_cdr(unpack_message(message.data))
+                        rows.add(state, message.time_ns, topic.publisher)
                     except ValueError as error:
                         raise bag.corrupt(message.place, f"{topic.name} with {error}", JOINTS_SCHEMA) from error
     used = [topic for topic, chosen in topics.items() if chosen]
@@ -104,6 +105,7 @@ class _Publisher:
     """Messages that one node may have published: they have one frame, one set of joints and the same fields."""
 
     number: int  #: from 1, in the order of their first messages
+    node: str  #: its name, where the bag has it
     frame: str | None  #: None where the header is empty
     joints: frozenset[str]
     fields: tuple[str, ...]  #: with values
@@ -111,6 +113,8 @@ class _Publisher:
 
     def may_be(self, other: _Publisher) -> bool:
         """Whether one node may be both: it leaves out the header of some messages."""
+        if self.node != other.node:
+            return False
         has_header = self.frame is not None and other.frame is not None
         return not has_header and self.fields == other.fields
 
@@ -118,7 +122,8 @@ class _Publisher:
         fields = " and ".join(self.fields) or "no values"
         frame = "without a header" if self.frame is None else f"frame {self.frame!r}"
         joints = ", ".join(sorted(self.joints))
-        return f"{self.number}: {fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
+        node = f"{self.node}, " if self.node else ""
+        return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
 
 
 SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
@@ -136,7 +141,7 @@ class _Rows:
         """Store the columns, each with field and joint, and the publisher that is chosen."""
         self._path = path
         self._chosen = publisher
-        self._publishers: dict[tuple[str | None, frozenset[str], tuple[str, ...]], _Publisher] = {}
+        self._publishers: dict[tuple[str, str | None, frozenset[str], tuple[str, ...]], _Publisher] = {}
         self._zero_is_a_time: bool | None = None  # None until a stamp has shown it
         self._undecided: list[tuple[JointState, int]] = []  # with the time of their recording
         self._columns = columns
@@ -147,7 +152,7 @@ class _Rows:
         self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}  # field, index and column, by the names
         self._unstamped = 0
 
-    def add(self, state: JointState, log_time_ns: int) -> None:
+    def add(self, state: JointState, log_time_ns: int, node: str) -> None:
         """Add a message; one without a stamp is taken at the time of its recording.
 
         Raises:
@@ -165,7 +170,7 @@ class _Rows:
             ]
         if not self._places[state.names]:
             return  # joints of something else
-        publisher = self._publisher_of(state)
+        publisher = self._publisher_of(state, node)
         publisher.messages += 1
         if self._chosen not in {None, publisher.number}:
             return
@@ -179,13 +184,13 @@ class _Rows:
             self._decide(zero_is_a_time=state.stamp_ns < SINCE_1970_NS)
         self._take(state, log_time_ns)
 
-    def _publisher_of(self, state: JointState) -> _Publisher:
+    def _publisher_of(self, state: JointState, node: str) -> _Publisher:
         fields = tuple(field for field in FIELDS if getattr(state, field))
         joints = frozenset(state.names)
         frame = None if not state.frame and state.stamp_ns == 0 else state.frame
-        key = (frame, joints, fields)
+        key = (node, frame, joints, fields)
         if key not in self._publishers:
-            self._publishers[key] = _Publisher(len(self._publishers) + 1, frame, joints, fields)
+            self._publishers[key] = _Publisher(len(self._publishers) + 1, node, frame, joints, fields)
         return self._publishers[key]
 
     def _decide(self, *, zero_is_a_time: bool) -> None:

@@ -54,6 +54,7 @@ from daq.log.plausibility import (
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
+from daq.log.ros1_bag import ROS_1_MAGIC
 from daq.log.table import ROW_MARGIN, Reader, Table, compare_stamps, rows_at_rate, section_values
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
@@ -524,30 +525,19 @@ def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:
 _HEADS: dict[bytes, Reader] = {
     MAGIC: read_bag,
     SQLITE_MAGIC: read_bag,
+    ROS_1_MAGIC: read_bag,
     ZSTD_MAGIC: read_bag,
     b"MATLAB ": read_mat,
     b"\x89HDF\r\n": read_mat,
 }
-_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".mat": read_mat}
-_ROS_1_BAG = b"#ROSBAG V"
+_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".bag": read_bag, ".mat": read_mat}
 
 
 def reader_of(path: Path) -> Reader:
-    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not.
-
-    Raises:
-        TableUnfit: the content is of a format that is not read.
-    """
+    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not."""
     if path.is_dir():
         return read_bag
     head = first_bytes(path)
-    if head.startswith(_ROS_1_BAG):
-        raise TableUnfit(
-            str(path),
-            found="a ROS 1 bag",
-            expected="CSV, a MATLAB file or a ROS 2 bag",
-            remedy="convert it to a ROS 2 bag: `rosbags-convert`",
-        )
     by_content = next((reader for start, reader in _HEADS.items() if head.startswith(start)), None)
     return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
 

@@ -28,6 +28,7 @@ class Topic:
 
     name: str  #: as publishers know it
     has_joint_states: bool  #: in CDR
+    publisher: str = ""  #: name of the node, where the bag has it (ROS 1)
 
 
 class BagMessage(NamedTuple):
