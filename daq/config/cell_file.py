@@ -105,6 +105,7 @@ def cell_from_bundle(
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
         chain=chain,
+        platform=model.robot.platform,
         clearance=clearance_of(model.workspace, model.clearance, _joints(model, chain, urdf)),
         effects=tuple(_effect(effect, places) for effect in model.effects),
         folder=None if file is None else file.parent,

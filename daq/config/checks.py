@@ -107,7 +107,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         if of_urdf:
             return None, faults + of_urdf
         chain = chain_of(model.robot, model.closures, urdf)
-        robot = robot_with(chain, urdf, model.robot.gravity_m_s2)
+        robot = robot_with(chain, urdf, model.robot.gravity_m_s2, model.robot.platform)
     except ModelError as error:
         found, _, expected = str(error).partition("; expected ")
         expected = f"a URDF of an arm: {expected}" if expected else "a URDF of an arm"
