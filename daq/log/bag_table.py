@@ -16,6 +16,7 @@ import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import TableUnfit, counted
+from daq.files import read_regular
 from daq.log.bag_file import open_bag
 from daq.log.mcap_bag import JointState, joint_state_from_cdr, unpack_message
 from daq.log.message import JOINTS_SCHEMA
@@ -33,6 +34,8 @@ from ident.arrays import BoolArray
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
+METADATA = "metadata.yaml"  #: Of a bag in its folder
+LARGEST_METADATA = 64 * 2**20
 PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")  #: Files of a bag in its folder
 
 
@@ -78,7 +81,49 @@ def _files(path: Path) -> list[Path]:
     # A player leaves what it has unpacked beside the packed file.
     unpacked = {file.with_name(file.name + PACKED) for file in files}
     once = [file for file in files if file not in unpacked]
+    _require_parts(path, once)
     return sorted(once, key=_part)
+
+
+def _require_parts(folder: Path, files: list[Path]) -> None:
+    """Refuse a folder that lacks a file which the recorder names: without it, the recording would end early.
+
+    Raises:
+        TableUnfit: a file is not there.
+    """
+    there = {file.name.removesuffix(PACKED) for file in files}
+    named = _named_parts(folder / METADATA)
+    missing = [name for name in named if Path(name).name.removesuffix(PACKED) not in there]
+    # A person may have renamed a file.
+    if missing and 0 < len(files) < len(named):
+        raise TableUnfit(
+            str(folder),
+            found=f"no {', '.join(missing)}, which {METADATA} names",
+            expected=f"all {counted(len(named), 'file')} of the bag",
+            remedy=f"copy the folder again; if the file was removed on purpose, take its name out of {METADATA}",
+        )
+
+
+def _named_parts(metadata: Path) -> list[str]:
+    """Return the files of a bag by its metadata, none if there are none; the rest of it is not read.
+
+    It may hold megabytes of quality of service, which no reader of YAML bounds.
+    """
+    try:
+        text = read_regular(metadata, LARGEST_METADATA).decode("utf-8", errors="replace")
+    except OSError:
+        return []  # a recorder that is killed leaves none
+    found = []
+    lines = iter(text.splitlines())
+    for line in lines:
+        if line.strip() == "relative_file_paths:":
+            break
+    for line in lines:
+        item = line.strip()
+        if not item.startswith("- "):
+            break
+        found.append(item.removeprefix("- ").strip().strip("'\""))
+    return found
 
 
 def _part(file: Path) -> tuple[int, str]:

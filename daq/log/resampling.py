@@ -205,7 +205,8 @@ def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArra
             expected="stamps that increase",
             remedy="were two recordings joined? import each by `keep` of the import description"
             if back_s
-            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time",
+            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time; in a bag, do "
+            "two nodes publish the same joints on the topic?",
         )
     return np.concatenate(([True], ~repeated))
 

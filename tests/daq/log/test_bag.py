@@ -285,6 +285,31 @@ def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     assert_whole(read(folder))
 
 
+def _in_parts(folder: Path, listed: str) -> Path:
+    """A bag of three files, with the metadata that its recorder writes."""
+    folder.mkdir()
+    for number in range(3):
+        write_bag(folder / f"bag_{number}.mcap", whole()[number * 80 : (number + 1) * 80])
+    metadata = f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  topics: []\n"
+    (folder / "metadata.yaml").write_text(metadata, encoding="utf-8")
+    return folder
+
+
+LISTED = "".join(f"  - bag_{number}.mcap\n" for number in range(3))
+
+
+@pytest.mark.parametrize("listed", [LISTED, LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")])
+def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None:
+    """Without its last part it would end early, and nothing else shows it."""
+    folder = _in_parts(tmp_path / "bag", listed)
+    assert_whole(read(folder))
+    (folder / "bag_2.mcap").rename(folder / "renamed_2.mcap")
+    assert_whole(read(folder))
+    (folder / "renamed_2.mcap").unlink()
+    with pytest.raises(TableUnfit, match=r"found no bag_2\.mcap, which metadata\.yaml names; expected all 3 files"):
+        read(folder)
+
+
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
     others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
     bag = write_bag(tmp_path / "run.mcap", [*others, *whole()])
