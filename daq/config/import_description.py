@@ -93,6 +93,9 @@ class CsvLayout:
     def _check_delimiter(self) -> CsvLayout:
         if self.delimiter == self.decimal:
             raise ValueError("a delimiter that is not the decimal sign")
+        first = "#" if self.comment is None else self.comment[0]
+        if first in "+-.," or first.isspace() or first.isdigit():
+            raise ValueError("a comment that begins as no number does, as #")
         return self
 
 

@@ -28,7 +28,7 @@ from daq.config.import_description import (
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, DaqError, TableUnfit, UsageError
+from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
@@ -136,7 +136,7 @@ def import_recording(
         of_holdout = samples.write(holdout, rows[first:])
         try:
             statistics = samples.write(out, rows[:first])
-        except DaqError:
+        except BaseException:
             holdout.unlink()
             raise
     remarks = [remark for file in files.values() for remark in file.remarks]

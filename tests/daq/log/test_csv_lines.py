@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
 
 from daq.config.import_description import (
     CsvLayout,
@@ -157,6 +160,13 @@ def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, 
         assert table.remarks == ("run.csv: left out, as `comment` says: 1 line among the rows",)
 
 
+@pytest.mark.parametrize("sign", ["1", "-", ".", " ", "+1", "\t#"])
+def test_a_comment_that_may_be_a_number_is_refused(sign: str) -> None:
+    """It would leave out rows."""
+    with pytest.raises(ValidationError, match="a comment that begins as no number does"):
+        TypeAdapter(CsvLayout).validate_python({"comment": sign})
+
+
 def test_empty_lines_are_left_out_where_stamps_show_that_nothing_is_missing(tmp_path: Path) -> None:
     lines = ["t,q,i", *ROWS[:5], "", *ROWS[5:]]
     table = _read(tmp_path, lines)
@@ -226,6 +236,51 @@ def test_times_are_kept(tmp_path: Path, from_s: float | None, to_s: float | None
     assert table.stamps is not None
     assert table.stamps.first_ns == round(1e9 * VALUES[rows][0, 0])
     assert table.stamps.time_s[-1] == pytest.approx(VALUES[rows][-1, 0] - VALUES[rows][0, 0])
+
+
+PIECES = (
+    *ROWS[:4],
+    "t,q,i",
+    "s,rad,A",
+    "# note",
+    "",
+    "sep=,",
+    "\u2212",
+    "nan,1,2",
+    '"',
+    ",,",
+    "a,b,c",
+    "1e999,0,0",
+    "\t",
+)
+PARTS = (None, KeptPart(from_row=2), KeptPart(to_row=3), KeptPart(from_s=0.01), KeptPart(to_s=0.02))
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    lines=st.lists(st.one_of(st.sampled_from(PIECES), st.text("0123456789.,-e #%;", max_size=12)), max_size=12),
+    time=st.sampled_from((None, TimeUnit.SECOND, TimeUnit.CLOCK)),
+    part=st.sampled_from(PARTS),
+    comment=st.sampled_from((None, "#", "a")),
+)
+def test_any_lines_are_read_or_refused(
+    lines: list[str],
+    time: TimeUnit | None,
+    part: KeptPart | None,
+    comment: str | None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Numbers that are read are finite, and each stamp has its row."""
+    folder = tmp_path_factory.getbasetemp()
+    try:
+        table = _read(folder, ["t,q,i", *lines], time=time, keep=part, comment=comment)
+    except TableUnfit:
+        return
+    assert np.isfinite(table.values).all()
+    assert len(table.values) > 0
+    if time is not None:
+        assert table.stamps is not None
+        assert len(table.stamps.time_s) == len(table.values)
 
 
 @pytest.mark.parametrize("part", [KeptPart(from_row=100), KeptPart(from_s=5.0)])
