@@ -133,6 +133,7 @@ class PositionColumns(Section):
 
     unit: PositionUnit
     side: Side
+    reversed: tuple[Name, ...] = ()  #: axes whose positions in the file count the other way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,6 +202,7 @@ class VelocityColumns(Section):
 
     unit: VelocityUnit
     side: Side
+    reversed: tuple[Name, ...] = ()  #: as of the positions
     #: Largest difference between the way by the velocities and by the positions, as a share of the latter.
     tolerance: Annotated[float, Field(gt=0.0, le=1.0)] = 0.2
 

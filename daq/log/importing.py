@@ -48,6 +48,7 @@ from daq.log.plausibility import (
     check_speed,
     check_steps,
     check_velocity,
+    counting_signs,
     in_si,
     require_changing,
     signed_counts,
@@ -260,6 +261,7 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     if wanted.position.unit is PositionUnit.COUNTS:
         position, remarks = signed_counts(position, wanted)
         check_counts(position, wanted, files)
+    position = position * counting_signs(wanted.position.reversed, cell.axis_names)
     clock = None
     rate_hz = wanted.rate_hz
     row = np.arange(len(position))
@@ -471,6 +473,14 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 found=f"{len(section.places)} columns",
                 expected=f"{n}, one for each axis of cell {cell.name!r}",
                 remedy="correct the description, or choose the cell with --cell",
+            )
+        others = [name for name in getattr(section, "reversed", ()) if name not in cell.axis_names]
+        if others:
+            raise ConfigurationInconsistent(
+                f"{description}: {key}.reversed",
+                found=", ".join(others),
+                expected=f"some of {', '.join(cell.axis_names)}",
+                remedy="name axes of the cell, or correct the cell with --cell",
             )
         if isinstance(section, ScaledColumns) and section.factors(cell.axis_names) is None:
             raise ConfigurationInconsistent(

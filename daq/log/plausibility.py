@@ -8,7 +8,7 @@ none (`daq.log.column_faults`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import pi
 
 import numpy as np
@@ -101,6 +101,11 @@ def signed_counts(position: FloatArray, wanted: ImportDescription) -> tuple[Floa
     return signed, tuple(remarks)
 
 
+def counting_signs(reversed_axes: Sequence[str], axes: Sequence[str]) -> FloatArray:
+    """Return −1 for each axis that counts the other way in a file, 1 for the others, shape (n,)."""
+    return np.array([-1.0 if axis in reversed_axes else 1.0 for axis in axes])
+
+
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
     """Convert positions or velocities to rad or m, shape (k, n).
 
@@ -123,7 +128,8 @@ def check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
     if (velocity := wanted.velocity) is None:
         return
-    stated = in_si(on_clock(section_values(velocity, files), clock), velocity, cell)
+    of_file = section_values(velocity, files) * counting_signs(velocity.reversed, cell.axis_names)
+    stated = in_si(on_clock(of_file, clock), velocity, cell)
     if velocity.side is Side.MOTOR:
         stated = stated @ np.linalg.inv(cell.ratio).T
     step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)

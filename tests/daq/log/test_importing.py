@@ -1137,3 +1137,48 @@ def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) ->
 def test_units_of_other_axes_are_refused(bench: Bench, capsys: pytest.CaptureFixture[str], unit: object) -> None:
     bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": unit})
     _refused(bench, capsys, 6, "current.unit")
+
+
+@pytest.mark.parametrize("unit", ["deg", "counts"])
+def test_axes_that_count_the_other_way_are_reversed(bench: Bench, unit: str) -> None:
+    """Their velocities are checked likewise."""
+    values = bench.joint_deg
+    side = "joint"
+    if unit == "counts":
+        values = np.rint(np.radians(bench.joint_deg) @ load_run_of(bench).T / (2 * pi) * 65536)
+        side = "motor"
+    section = {"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": side}
+    bench.write_csv(np.hstack((values, bench.current_a)))
+    bench.describe(position=section)
+    assert bench.run() == 0
+    expected = load_run(bench.out)[0].position_rad
+    bench.out.unlink()
+    values = values.copy()
+    values[:, [1, 3]] *= -1.0
+    bench.write_csv(np.hstack((values, bench.current_a)))
+    bench.describe(position={**section, "reversed": ["J2", "J4"]})
+    assert bench.run() == 0
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=1e-9)
+
+
+def test_velocities_have_signs_of_their_own(bench: Bench) -> None:
+    names = [*NAMES, *(f"v{axis + 1}" for axis in range(6))]
+    velocity = np.gradient(bench.joint_deg, 0.001, axis=0)
+    velocity[:, 2] *= -1.0
+    rows = np.hstack((bench.joint_deg, bench.current_a, velocity)).tolist()
+    lines = [",".join(names), *(",".join(map(repr, row)) for row in rows)]
+    (bench.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    section = {"file": "run.csv", "columns": names[12:], "unit": "deg/s", "side": "joint"}
+    bench.describe(velocity=section)
+    assert bench.run() == 4
+    bench.describe(velocity={**section, "reversed": ["J3"]})
+    assert bench.run() == 0
+
+
+@pytest.mark.parametrize("key", ["position", "velocity"])
+def test_a_reversed_axis_that_is_none_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str], key: str) -> None:
+    section = {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint", "reversed": ["J9"]}
+    if key == "velocity":
+        section |= {"unit": "deg/s", "columns": [f"v{axis}" for axis in range(6)]}
+    bench.describe(**{key: section})
+    _refused(bench, capsys, 6, f"{key}.reversed", "J9", "some of J1, J2")
