@@ -177,7 +177,9 @@ def test_empty_lines_are_left_out_where_stamps_show_that_nothing_is_missing(tmp_
 
 
 def test_line_ends_that_were_doubled_make_no_rows(tmp_path: Path) -> None:
-    doubled = [line for row in ["t,q,i", *ROWS] for line in (row, "")]
+    doubled: list[str] = []
+    for row in ("t,q,i", *ROWS):
+        doubled += [row, ""]
     np.testing.assert_array_equal(_read(tmp_path, doubled, time=None).values, READ)
 
 
