@@ -236,13 +236,14 @@ def _fit(request: FitRequest) -> CaseFit:
 def _full_set(request: FitRequest, fitted: Fit) -> FullSet:
     """Find all standard parameters under the prior that is asked for."""
 
+    from daq.config.urdf_text import urdf_text
     from daq.config.yaml_file import read_yaml_bytes
     from daq.workflow.full_parameters import DEFAULT_TOLERANCE, OF_CELL, full_set
 
     urdf = fitted.cell.urdf
     name = OF_CELL
     if request.prior is not None:
-        urdf = read_yaml_bytes(request.prior).decode("utf-8", errors="replace")
+        urdf = urdf_text(read_yaml_bytes(request.prior), str(request.prior))
         name = request.prior.name
     return full_set(fitted, urdf, name, request.prior_tolerance or DEFAULT_TOLERANCE)
 

@@ -103,20 +103,27 @@ def import_files(
     data: Annotated[Path, typer.Option("--data", help="Folder of the files.")],
     out: NewLogOption,
     cell: Annotated[Path | None, typer.Option("--cell", help="Another cell file than the description's.")] = None,
+    holdout: Annotated[
+        Path | None,
+        output_option("--holdout", "Log to write of the part that `holdout` of the description names (.mcap)."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Convert CSV files, MATLAB files or ROS 2 bags of another controller to a log."""
+    """Convert CSV files, MATLAB files or ROS bags of another controller to a log, or to two, one held out."""
     from daq.log.importing import import_recording
     from daq.report.log import import_report, timing_text
 
-    imported = import_recording(description, data, out, software=software(), cell_path=cell)
+    imported = import_recording(description, data, out, software=software(), cell_path=cell, holdout=holdout)
     WRITTEN.append(out)
     statistics = imported.statistics
     timing = imported.timing
     if json:
-        print_json(import_report(out, imported))
+        print_json(import_report(out, imported, holdout))
         return
     say(f"{out}: {counted(statistics.samples, 'sample')} of {len(statistics.missing)} axes")
+    if holdout is not None and imported.holdout is not None:
+        WRITTEN.append(holdout)
+        say(f"{holdout}: {counted(imported.holdout.samples, 'sample')}, held out")
     for line in (*(() if timing is None else (timing_text(timing),)), *imported.remarks):
         say(printable(line))
 

@@ -200,6 +200,7 @@ class Cell:
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
     recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
     chain: ClosedChain | None = None  #: how the loops of a closed chain close; None of a serial robot
+    platform: str | None = None  #: link that carries the payload; that of the last joint when None
 
     @property
     def controller_path(self) -> Path | None:
@@ -249,7 +250,7 @@ def robot_of(cell: Cell) -> Robot:
     Raises:
         ModelError: the URDF describes no robot.
     """
-    return robot_with(cell.chain, cell.urdf, cell.gravity_m_s2)
+    return robot_with(cell.chain, cell.urdf, cell.gravity_m_s2, cell.platform)
 
 
 def joint_names(cell: Cell) -> tuple[str, ...]:

@@ -100,14 +100,22 @@ def platform_frame(robot: ChainModel, urdf: str) -> Place:
     return read_urdf(urdf).links[robot.platform]
 
 
-def robot_with(chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float]) -> Robot:
+def robot_with(
+    chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float], platform: str | None = None
+) -> Robot:
     """Read a cell's robot.
+
+    Args:
+        chain: how its loops close, with the link that carries the payload; None of a serial robot.
+        urdf: text of the URDF.
+        gravity_m_s2: gravity in the base frame.
+        platform: of a serial robot, the link that carries the payload; that of the last joint when None.
 
     Raises:
         ModelError: see `ident.model.urdf.robot_from_urdf`.
     """
     if chain is None:
-        return robot_from_urdf(urdf, gravity_m_s2)
+        return robot_from_urdf(urdf, gravity_m_s2, platform=platform)
     return robot_from_urdf(
         urdf,
         gravity_m_s2,
@@ -127,7 +135,9 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
     given = [key for key in ChainModel.model_fields if getattr(robot, key)]
     if not closures:
         for key in given:
-            yield Fault(("robot", key), "given without `closures`", "no such key in a serial robot")
+            if key != "platform":
+                yield Fault(("robot", key), "given without `closures`", "no such key in a serial robot")
+        yield from _carrier_faults(robot, urdf)
         return
     for key, what in (
         ("motors", "the joint of each axis"),
@@ -150,6 +160,17 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
         except ModelError as error:
             found, _, expected = str(error).partition("; expected ")
             yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
+
+
+def _carrier_faults(robot: ChainModel, urdf: str) -> Iterator[Fault]:
+    """Find a link of a serial robot that cannot carry the payload."""
+    if robot.platform is None:
+        return
+    links = read_urdf(urdf).links
+    moving = [name for name, place in links.items() if place.joint >= 0]
+    if robot.platform not in moving:
+        found = f"{robot.platform!r}, which does not move" if robot.platform in links else f"{robot.platform!r}"
+        yield Fault(("robot", "platform"), found, f"a link that moves: {', '.join(moving)}")
 
 
 def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:

@@ -17,6 +17,7 @@ from daq.config.cell_closures import ClosedChain, chain_of, platform_frame
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.drive import drive_from_text
+from daq.config.urdf_text import urdf_text
 from daq.config.workspace import clearance_of
 from daq.config.yaml_file import (
     MAX_BYTES,
@@ -79,7 +80,7 @@ def cell_from_bundle(
     names = names or {}
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
     model = read_model(document, CellModel, None if file is None else file.parent)
-    urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
+    urdf = urdf_text(_member(files, URDF, names), names.get(URDF, URDF))
     members = {drive: f"{DRIVES}{drive}.yaml" for drive in model.drives}
     profiles: dict[str, DriveProfile] = {}
     for drive, member in members.items():
@@ -104,6 +105,7 @@ def cell_from_bundle(
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
         chain=chain,
+        platform=model.robot.platform,
         clearance=clearance_of(model.workspace, model.clearance, _joints(model, chain, urdf)),
         effects=tuple(_effect(effect, places) for effect in model.effects),
         folder=None if file is None else file.parent,

@@ -179,7 +179,7 @@ class KnownModel(StrictModel):
 class PayloadModel(StrictModel):
     """A weighed body, and the parameters of its drawing.
 
-    The centre of mass is in the last joint's frame, on a closed chain in that of the platform's link; the inertia xx,
+    The centre of mass is in the last joint's frame, with a `platform` in that of this link; the inertia xx,
     xy, xz, yy, yz, zz is about the centre of mass, in the directions of that frame, as a URDF has it (xy = −∫xy dm).
     """
 

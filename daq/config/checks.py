@@ -46,6 +46,7 @@ from ident.plausible import (
     within,
 )
 
+OTHER_JOINT = "is of type"  #: Of the reader's message about a joint that can be no axis
 LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
 
 
@@ -88,7 +89,9 @@ def check(
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
-        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the cell file")
+        is_of_urdf = any(fault.path == ("robot", "urdf") for fault in faults)
+        remedy = "correct the cell file" + (", or the URDF that it names" if is_of_urdf else "")
+        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy=remedy)
 
 
 def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
@@ -104,10 +107,13 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         if of_urdf:
             return None, faults + of_urdf
         chain = chain_of(model.robot, model.closures, urdf)
-        robot = robot_with(chain, urdf, model.robot.gravity_m_s2)
+        robot = robot_with(chain, urdf, model.robot.gravity_m_s2, model.robot.platform)
     except ModelError as error:
-        expected = "a URDF of an arm; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
-        return None, [*faults, Fault(("robot", "urdf"), str(error), expected)]
+        found, _, expected = str(error).partition("; expected ")
+        expected = f"a URDF of an arm: {expected}" if expected else "a URDF of an arm"
+        if OTHER_JOINT in found:
+            expected += "; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
+        return None, [*faults, Fault(("robot", "urdf"), found, expected)]
     names = [joint.name for joint in robot.axes]
     more = len(names) - len(axes)
     if more and chain is not None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -27,6 +29,7 @@ Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
 RATES_HZ = (1.0, 1e6)  #: Least and largest sampling rate, stated or by the stamps
 Rate = Annotated[float, Field(ge=RATES_HZ[0], le=RATES_HZ[1])]
+UnitName = Annotated[str, Field(min_length=1)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 SMALLEST_FACTOR = 1e-9
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
@@ -57,11 +60,17 @@ class TimeUnit(Enum):
     MICROSECOND = "us"
     NANOSECOND = "ns"
     ISO_8601 = "iso8601"  #: Date and time with a zone: 2026-03-01T08:00:00.004+01:00
+    CLOCK = "clock"  #: Time of day, with a date before it or not, without a zone: 08:00:00.004
 
     @property
     def digits(self) -> int:
         """Decimal digits below a second: 3 for milliseconds."""
-        return {"s": 0, "ms": 3, "us": 6, "ns": 9, "iso8601": 0}[self.value]
+        return {"s": 0, "ms": 3, "us": 6, "ns": 9, "iso8601": 0, "clock": 0}[self.value]
+
+    @property
+    def is_text(self) -> bool:
+        """Whether a stamp is a text, not a number."""
+        return self in {TimeUnit.ISO_8601, TimeUnit.CLOCK}
 
     @property
     def seconds(self) -> float:
@@ -77,11 +86,16 @@ class CsvLayout:
     decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."  #: point or comma
     skip_rows: Annotated[int, Field(ge=0)] = 0  #: lines before the header
     header: bool = True  #: whether a line of names precedes the numbers
+    #: Begin of lines among the rows that are left out; before and after the rows, #, % and // are known.
+    comment: Annotated[str, Field(min_length=1, max_length=4)] | None = None
 
     @model_validator(mode="after")
     def _check_delimiter(self) -> CsvLayout:
         if self.delimiter == self.decimal:
             raise ValueError("a delimiter that is not the decimal sign")
+        first = "#" if self.comment is None else self.comment[0]
+        if first in "+-.," or first.isspace() or first.isdigit():
+            raise ValueError("a comment that begins as no number does, as #")
         return self
 
 
@@ -89,8 +103,28 @@ class CsvLayout:
 class Section:
     """Columns of a quantity, one for each axis."""
 
-    file: FileName
-    columns: SomeColumns
+    #: One file, or one for each axis; their rows belong together.
+    file: FileName | Annotated[tuple[FileName, ...], Field(min_length=1)]
+    columns: SomeColumns  #: one column of several files has the same name in each
+
+    @property
+    def places(self) -> tuple[tuple[str, Column], ...]:
+        """File and column of each axis."""
+        if isinstance(self.file, str):
+            return tuple((self.file, column) for column in self.columns)
+        columns = self.columns * len(self.file) if len(self.columns) == 1 else self.columns
+        return tuple(zip(self.file, columns, strict=True))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files, each once."""
+        return (self.file,) if isinstance(self.file, str) else tuple(dict.fromkeys(self.file))
+
+    @model_validator(mode="after")
+    def _check_files(self) -> Self:
+        if isinstance(self.file, tuple) and len(self.columns) not in {1, len(self.file)}:
+            raise ValueError("as many files as columns, or one column of the same name in each file")
+        return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +133,7 @@ class PositionColumns(Section):
 
     unit: PositionUnit
     side: Side
+    reversed: tuple[Name, ...] = ()  #: axes whose positions in the file count the other way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +163,16 @@ class ScaledColumns(Section):
 class CurrentColumns(ScaledColumns):
     """Columns of the current-loop reference; numbers × factor are in the gains' unit."""
 
-    unit: Annotated[str, Field(min_length=1)]
+    #: One for all axes, a list in their order, or a mapping from their names, as N beside Nm.
+    unit: UnitName | Annotated[tuple[UnitName, ...], Field(min_length=1)] | dict[Name, UnitName]
+
+    def units(self, axes: Sequence[str]) -> tuple[str, ...] | None:
+        """Return the unit of each axis; None if other axes have one."""
+        if isinstance(self.unit, str):
+            return (self.unit,) * len(axes)
+        if isinstance(self.unit, dict):
+            return tuple(self.unit[axis] for axis in axes) if self.unit.keys() == set(axes) else None
+        return self.unit if len(self.unit) == len(axes) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,6 +202,7 @@ class VelocityColumns(Section):
 
     unit: VelocityUnit
     side: Side
+    reversed: tuple[Name, ...] = ()  #: as of the positions
     #: Largest difference between the way by the velocities and by the positions, as a share of the latter.
     tolerance: Annotated[float, Field(gt=0.0, le=1.0)] = 0.2
 
@@ -172,6 +217,48 @@ class TimeColumn:
     rate_hz: Rate | None = None  #: rate to resample to [Hz]; that of the stamps by default
     #: Longest step that is interpolated, in usual steps; a longer one is a gap, and refused.
     largest_gap_periods: Annotated[float, Field(ge=1.5, le=100.0)] = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeptPart:
+    """Part of a recording that is imported: rows of numbers, counted from 1, or seconds since the first of them."""
+
+    from_row: Annotated[int, Field(ge=1)] | None = None  #: first row
+    to_row: Annotated[int, Field(ge=1)] | None = None  #: last row
+    from_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None  #: begin
+    to_s: Annotated[float, Field(ge=0.0, le=1e9)] | None = None  #: end
+
+    @property
+    def is_by_time(self) -> bool:
+        """Whether times are stated."""
+        return self.from_s is not None or self.to_s is not None
+
+    @property
+    def is_by_row(self) -> bool:
+        """Whether rows are stated."""
+        return self.from_row is not None or self.to_row is not None
+
+    @property
+    def rows(self) -> slice:
+        """The rows, counted from 0; all of them where only times are stated."""
+        return slice((self.from_row or 1) - 1, self.to_row)
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> KeptPart:
+        if self.is_by_time and self.is_by_row:
+            raise ValueError("rows or times, not both")
+        last_row = self.to_row or sys.maxsize
+        last_s = inf if self.to_s is None else self.to_s
+        if (self.from_row or 1) > last_row or (self.from_s or 0.0) >= last_s:
+            raise ValueError("a begin before the end")
+        return self
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldoutPart:
+    """End of a recording that becomes a log of its own, for the final error of a fit."""
+
+    from_s: Annotated[float, Field(gt=0.0, le=1e9)]  #: its begin, since the first sample that is imported [s]
 
 
 class ImportDescription(StrictModel):
@@ -190,7 +277,11 @@ class ImportDescription(StrictModel):
     temperature: TemperatureColumns | None = None  #: columns of the temperature
     rate_hz: Rate | None = None  #: sampling rate [Hz]; either this or `time`
     time: TimeColumn | None = None  #: the time column, instead of a rate
+    keep: KeptPart | None = None  #: part of the recording that is imported; all of it by default
+    holdout: HoldoutPart | None = None  #: end of it that becomes a second log
     topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
+    #: Which publisher of that topic, by the number that an import names; needed if several publish the same joints.
+    publisher: Annotated[int, Field(ge=1)] | None = None
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
@@ -204,7 +295,8 @@ class ImportDescription(StrictModel):
         """Return the files, each with its columns of numbers; the time column is not among them."""
         columns: dict[str, dict[Column, None]] = {}
         for _, section in self.sections():
-            columns.setdefault(section.file, {}).update(dict.fromkeys(section.columns))
+            for file, column in section.places:
+                columns.setdefault(file, {})[column] = None
         if self.time is not None:
             columns.setdefault(self.time.file, {})
         return {file: tuple(found) for file, found in columns.items()}
@@ -226,15 +318,16 @@ def load_import(path: Path) -> ImportDescription:
     if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
         expected = "motor; counts are of the motor encoder"
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
-    axes = len(wanted.position.columns)
+    axes = len(wanted.position.places)
     for name, section in wanted.sections():
         factors = section.stated_factors if isinstance(section, ScaledColumns) else ()
         if any(abs(one) < SMALLEST_FACTOR for one in factors):
             expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
         # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import counts.
-        if len(section.columns) != axes and 1 not in {axes, len(section.columns)}:
-            found = f"{len(section.columns)} columns"
+        own = len(section.places)
+        if own != axes and 1 not in {axes, own}:
+            found = f"{own} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
     timed = () if wanted.time is None else (wanted.time.column,)
     named = [c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)]

@@ -139,6 +139,7 @@ def _sections(cell: Cell) -> dict[str, object]:
         GRAVITY: cell.gravity_m_s2,
         # Joints without a motor and pivots follow from the rest.
         "closures": None if chain is None else replace(chain, passive_joints=(), pivots=()),
+        "robot.platform": cell.platform,
         "drive_train.ratio": cell.ratio.tolist(),
         "bus": cell.buses,
         "sync": cell.sync,

@@ -1,4 +1,4 @@
-"""Open a file of a ROS 2 bag: MCAP or SQLite, packed as a whole by zstd or not.
+"""Open a file of a bag: MCAP or SQLite of ROS 2, or one of ROS 1; packed as a whole by zstd or not.
 
 The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is bounded by its size.
 """
@@ -19,6 +19,7 @@ from daq.files import open_regular
 from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
 from daq.log.message import JOINTS_SCHEMA
+from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 STEPS = 10_000_000  #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
@@ -120,7 +121,7 @@ class SqliteBag:
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[McapBag | SqliteBag]:
+def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
     """Open a file of a bag, by its content; a file that cannot be read is reported with its messages.
 
     Raises:
@@ -136,9 +137,12 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag]:
         yield _bag(path, source)
 
 
-def _bag(path: Path, source: Path) -> McapBag | SqliteBag:
-    if first_bytes(source).startswith(SQLITE_MAGIC):
+def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
+    head = first_bytes(source)
+    if head.startswith(SQLITE_MAGIC):
         return SqliteBag(path, source)
+    if head.startswith(ROS_1_MAGIC):
+        return Ros1Bag(path, source)
     return McapBag(path, source)
 
 

@@ -1,28 +1,42 @@
-"""Read joint states from ROS 2 bags as tables.
+"""Read joint states from ROS bags as tables.
 
 A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
-stamp that hold different joints make one row, because several publishers may share a topic.
+stamp that hold different joints make one row, because several publishers may share a topic. Several that publish the
+same joints are told apart by frame, joints and fields, and one of them is chosen.
 """
 
 from __future__ import annotations
 
 from array import array
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
+from daq.config.import_description import Column, ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import TableUnfit, counted
+from daq.files import read_regular
 from daq.log.bag_file import open_bag
 from daq.log.mcap_bag import JointState, joint_state_from_cdr, unpack_message
 from daq.log.message import JOINTS_SCHEMA
-from daq.log.table import LATEST_NS, Table, digest_of, require_finite, stamps_of_ns
+from daq.log.table import (
+    LATEST_NS,
+    Table,
+    digest_of,
+    require_finite,
+    require_kept,
+    rows_in_time,
+    stamps_of_ns,
+)
+from ident.arrays import BoolArray
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
-PATTERNS = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")  #: Files of a bag in its folder
+METADATA = "metadata.yaml"  #: Of a bag in its folder
+LARGEST_METADATA = 64 * 2**20
+PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")  #: Files of a bag in its folder
 
 
 def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
@@ -35,7 +49,7 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     if time is not None and (time.column != STAMP or time.unit is not TimeUnit.NANOSECOND):
         found = f"time column {time.column!r} in {time.unit.value}"
         raise _unfit(path, found, f"`column: {STAMP}` and `unit: ns`", "correct `time` in the import description")
-    rows = _Rows(path, tuple(_field_and_joint(path, column) for column in columns))
+    rows = _Rows(path, tuple(_field_and_joint(path, column) for column in columns), wanted.publisher)
     topics: dict[str, bool] = {}
     for file in _files(path):
         with open_bag(file) as bag, closing(bag.messages()) as messages:
@@ -45,7 +59,8 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
                 topics[topic.name] = chosen
                 if chosen:
                     try:
-                        rows.add(joint_state_from_cdr(unpack_message(message.data)), message.time_ns)
+                        state = joint_state_from_cdr(unpack_message(message.data))
+                        rows.add(state, message.time_ns, topic.publisher)
                     except ValueError as error:
                         raise bag.corrupt(message.place, f"{topic.name} with {error}", JOINTS_SCHEMA) from error
     used = [topic for topic, chosen in topics.items() if chosen]
@@ -55,7 +70,7 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     if len(used) > 1:
         remedy = "choose one in the import description: `topic: NAME`"
         raise _unfit(path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy)
-    return rows.table(columns, time)
+    return rows.table(columns, time, wanted.keep)
 
 
 def _files(path: Path) -> list[Path]:
@@ -66,7 +81,49 @@ def _files(path: Path) -> list[Path]:
     # A player leaves what it has unpacked beside the packed file.
     unpacked = {file.with_name(file.name + PACKED) for file in files}
     once = [file for file in files if file not in unpacked]
+    _require_parts(path, once)
     return sorted(once, key=_part)
+
+
+def _require_parts(folder: Path, files: list[Path]) -> None:
+    """Refuse a folder that lacks a file which the recorder names: without it, the recording would end early.
+
+    Raises:
+        TableUnfit: a file is not there.
+    """
+    there = {file.name.removesuffix(PACKED) for file in files}
+    named = _named_parts(folder / METADATA)
+    missing = [name for name in named if Path(name).name.removesuffix(PACKED) not in there]
+    # A person may have renamed a file.
+    if missing and 0 < len(files) < len(named):
+        raise TableUnfit(
+            str(folder),
+            found=f"no {', '.join(missing)}, which {METADATA} names",
+            expected=f"all {counted(len(named), 'file')} of the bag",
+            remedy=f"copy the folder again; if the file was removed on purpose, take its name out of {METADATA}",
+        )
+
+
+def _named_parts(metadata: Path) -> list[str]:
+    """Return the files of a bag by its metadata, none if there are none; the rest of it is not read.
+
+    It may hold megabytes of quality of service, which no reader of YAML bounds.
+    """
+    try:
+        text = read_regular(metadata, LARGEST_METADATA).decode("utf-8", errors="replace")
+    except OSError:
+        return []  # a recorder that is killed leaves none
+    found = []
+    lines = iter(text.splitlines())
+    for line in lines:
+        if line.strip() == "relative_file_paths:":
+            break
+    for line in lines:
+        item = line.strip()
+        if not item.startswith("- "):
+            break
+        found.append(item.removeprefix("- ").strip().strip("'\""))
+    return found
 
 
 def _part(file: Path) -> tuple[int, str]:
@@ -88,6 +145,32 @@ def _field_and_joint(path: Path, column: Column) -> tuple[str, str]:
     return field, joint
 
 
+@dataclass(slots=True)
+class _Publisher:
+    """Messages that one node may have published: they have one frame, one set of joints and the same fields."""
+
+    number: int  #: from 1, in the order of their first messages
+    node: str  #: its name, where the bag has it
+    frame: str | None  #: None where the header is empty
+    joints: frozenset[str]
+    fields: tuple[str, ...]  #: with values
+    messages: int = 0
+
+    def may_be(self, other: _Publisher) -> bool:
+        """Whether one node may be both: it leaves out the header of some messages."""
+        if self.node != other.node:
+            return False
+        has_header = self.frame is not None and other.frame is not None
+        return not has_header and self.fields == other.fields
+
+    def __str__(self) -> str:
+        fields = " and ".join(self.fields) or "no values"
+        frame = "without a header" if self.frame is None else f"frame {self.frame!r}"
+        joints = ", ".join(sorted(self.joints))
+        node = f"{self.node}, " if self.node else ""
+        return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
+
+
 SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
 UNDECIDED = 1000  #: Messages with a stamp of 0 that wait for a later one, which says what 0 means
 
@@ -99,9 +182,11 @@ class _Rows:
     publisher left out. The first other stamp of the bag tells the two apart.
     """
 
-    def __init__(self, path: Path, columns: tuple[tuple[str, str], ...]) -> None:
-        """Store the columns, each with field and joint."""
+    def __init__(self, path: Path, columns: tuple[tuple[str, str], ...], publisher: int | None) -> None:
+        """Store the columns, each with field and joint, and the publisher that is chosen."""
         self._path = path
+        self._chosen = publisher
+        self._publishers: dict[tuple[str, str | None, frozenset[str], tuple[str, ...]], _Publisher] = {}
         self._zero_is_a_time: bool | None = None  # None until a stamp has shown it
         self._undecided: list[tuple[JointState, int]] = []  # with the time of their recording
         self._columns = columns
@@ -112,7 +197,7 @@ class _Rows:
         self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}  # field, index and column, by the names
         self._unstamped = 0
 
-    def add(self, state: JointState, log_time_ns: int) -> None:
+    def add(self, state: JointState, log_time_ns: int, node: str) -> None:
         """Add a message; one without a stamp is taken at the time of its recording.
 
         Raises:
@@ -130,6 +215,10 @@ class _Rows:
             ]
         if not self._places[state.names]:
             return  # joints of something else
+        publisher = self._publisher_of(state, node)
+        publisher.messages += 1
+        if self._chosen not in {None, publisher.number}:
+            return
         if self._zero_is_a_time is None:
             if state.stamp_ns == 0:
                 _require_possible(log_time_ns)
@@ -139,6 +228,15 @@ class _Rows:
                 return
             self._decide(zero_is_a_time=state.stamp_ns < SINCE_1970_NS)
         self._take(state, log_time_ns)
+
+    def _publisher_of(self, state: JointState, node: str) -> _Publisher:
+        fields = tuple(field for field in FIELDS if getattr(state, field))
+        joints = frozenset(state.names)
+        frame = None if not state.frame and state.stamp_ns == 0 else state.frame
+        key = (node, frame, joints, fields)
+        if key not in self._publishers:
+            self._publishers[key] = _Publisher(len(self._publishers) + 1, node, frame, joints, fields)
+        return self._publishers[key]
 
     def _decide(self, *, zero_is_a_time: bool) -> None:
         """Fix the meaning of a stamp of 0, and take the messages that waited for it."""
@@ -151,6 +249,8 @@ class _Rows:
     def _take(self, state: JointState, log_time_ns: int) -> None:
         """Begin or complete the row of a message."""
         places = self._places[state.names]
+        if any(not getattr(state, field) for field, _, _ in places):
+            return  # `_require_one_publisher` says so
         width = len(self._columns)
         stamp_ns = state.stamp_ns
         if stamp_ns == 0 and not self._zero_is_a_time:
@@ -173,42 +273,140 @@ class _Rows:
         if all(self._present[row * width : (row + 1) * width]):
             del self._begun[stamp_ns]
 
-    def table(self, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
-        """Return the complete rows.
+    def _require_one_publisher(self) -> None:
+        """Refuse joints that several nodes publish, and fields that nobody does.
+
+        Raises:
+            TableUnfit: several publish the same joints, the chosen one is not there, or a field has no values.
+        """
+        known = list(self._publishers.values())
+        if self._chosen is not None:
+            if self._chosen > len(known):
+                listed = "; ".join(map(str, known)) or "none"
+                raise _unfit(
+                    self._path,
+                    f"publisher {self._chosen}, and those of the topic are {listed}",
+                    "the number of one of them",
+                    "correct `publisher` in the import description",
+                )
+            known = [known[self._chosen - 1]]
+        wanted = {joint for _, joint in self._columns}
+        sharing = []
+        for one in known:
+            others = [other for other in known if other is not one and not one.may_be(other)]
+            if any(one.joints & other.joints & wanted for other in others):
+                sharing.append(one)
+        if sharing:
+            raise _unfit(
+                self._path,
+                f"{len(sharing)} publishers of the same joints on one topic: {'; '.join(map(str, sharing))}",
+                "one publisher of each joint",
+                f"choose one in the import description, as in `publisher: {self._fullest(sharing).number}`, or record "
+                "again without the others",
+            )
+        for one in known:
+            lacking = [field for field, joint in self._columns if joint in one.joints and field not in one.fields]
+            if lacking:
+                found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
+                raise _unfit(self._path, found, "one value a joint", "does this controller publish it?")
+
+    def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
+        """Return the publisher with most of the fields that are read, then with most messages."""
+        fields = {field for field, _ in self._columns}
+        return max(publishers, key=lambda one: (len(fields & set(one.fields)), one.messages))
+
+    def table(self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None) -> Table:
+        """Return the complete rows of the part that is kept.
 
         Raises:
             TableUnfit: a joint is missing in every row or between complete ones, or a number is not finite.
         """
         self._decide(zero_is_a_time=self._zero_is_a_time is True)
+        self._require_one_publisher()
         width = len(self._columns)
         present = np.frombuffer(self._present, dtype=np.bool_).reshape(-1, width)
-        joints = sorted({name for names in self._places for name in names})
+        values = np.frombuffer(self._values).reshape(-1, width)
+        kept = self._kept(part)
+        present = present[kept]
+        values = values[kept]
+        stamp_ns = self._stamp_ns[kept]
+        is_number = present & ~np.isnan(values)
+        self._require_joints(columns, present, is_number)
+        whole = np.flatnonzero(is_number.all(axis=1))
+        inside = slice(whole[0], whole[-1] + 1) if whole.size else slice(0, 1)
+        if not whole.size or len(whole) < len(is_number[inside]):
+            row = int(np.argmin(is_number[inside].all(axis=1))) + inside.start
+            raise self._incomplete_row(columns, stamp_ns[row], present[row], is_number[row])
+        remarks = self._remarks(present, is_number, inside)
+        clock = stamps_of_ns(stamp_ns[inside])
+        stamps = None if time is None else clock
+        digest = digest_of(values[inside], clock)
+        first_row = kept.start + inside.start
+        table = Table(self._path, columns, values[inside], digest, stamps, first_row=first_row, remarks=remarks)
+        return require_finite(table)
+
+    def _kept(self, part: KeptPart | None) -> slice:
+        """Return the rows of the part that is kept."""
+        count = len(self._stamp_ns)
+        rows = slice(None) if part is None else part.rows
+        if part is not None and part.is_by_time and count:
+            rows = rows_in_time(stamps_of_ns(self._stamp_ns), part)
+        if part is not None:
+            require_kept(self._path, count, rows)
+        return slice(*rows.indices(count))
+
+    def _require_joints(self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray) -> None:
+        """Refuse joints that no message has, and fields that are never a number."""
         absent = [str(columns[number]) for number in np.flatnonzero(~present.any(axis=0))]
         if absent:
+            joints = sorted({name for names in self._places for name in names})
             raise _unfit(self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}")
-        whole = np.flatnonzero(present.all(axis=1))
-        inside = slice(whole[0], whole[-1] + 1) if whole.size else slice(0, 1)
-        if not whole.size or len(whole) < len(present[inside]):
-            row = int(np.argmin(present[inside].all(axis=1))) + inside.start
-            lacking = [str(columns[number]) for number in np.flatnonzero(~present[row])]
-            raise _unfit(
+        empty = [str(columns[number]) for number in np.flatnonzero(~is_number.any(axis=0))]
+        if empty:
+            remedy = "does this controller measure it? name a field that it publishes"
+            raise _unfit(self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy)
+
+    def _incomplete_row(
+        self, columns: tuple[Column, ...], stamp_ns: int, present: BoolArray, is_number: BoolArray
+    ) -> TableUnfit:
+        """Make the error for a row between complete ones that lacks joints, or numbers of them."""
+        at = f"at {stamp_ns * 1e-9:.9f} s"
+        absent = [str(columns[number]) for number in np.flatnonzero(~present)]
+        if absent:
+            return _unfit(
                 self._path,
-                f"no {', '.join(lacking)} at {self._stamp_ns[row] * 1e-9:.9f} s",
+                f"no {', '.join(absent)} {at}",
                 "all joints in messages of the same stamp",
                 "messages are missing, or joints are stamped apart: record a topic that has all joints in each message",
             )
+        empty = [str(columns[number]) for number in np.flatnonzero(~is_number)]
+        return _unfit(
+            self._path,
+            f"nan for {', '.join(empty)} {at}",
+            "numbers, but for the begin and the end of the bag",
+            "samples are never invented: import what is before it and what is behind it by `keep`, as recordings of "
+            "their own",
+        )
+
+    def _remarks(self, present: BoolArray, is_number: BoolArray, inside: slice) -> tuple[str, ...]:
+        """Say what was left out at the ends of the bag, and what was chosen."""
         remarks = []
-        if len(whole) < len(present):
-            left_out = counted(len(present) - len(whole), "stamp")
-            remarks.append(f"left out, as joints are missing at the ends of the bag: {left_out}")
+        is_outside = np.ones(len(present), dtype=np.bool_)
+        is_outside[inside] = False
+        has_joints = present.all(axis=1)
+        lacking = int(np.count_nonzero(is_outside & ~has_joints))
+        empty = int(np.count_nonzero(is_outside & has_joints))
+        if lacking:
+            remarks.append(f"left out, as joints are missing at the ends of the bag: {counted(lacking, 'stamp')}")
+        if empty:
+            remarks.append(f"left out, as values are nan at the ends of the bag: {counted(empty, 'stamp')}")
         if self._unstamped:
             unstamped = counted(self._unstamped, "message")
             remarks.append(f"{unstamped} without a stamp: the time of the recording is used")
-        values = np.frombuffer(self._values).reshape(-1, width)[inside]
-        clock = stamps_of_ns(self._stamp_ns[inside])
-        stamps = None if time is None else clock
-        table = Table(self._path, columns, values, digest_of(values, clock), stamps, remarks=tuple(remarks))
-        return require_finite(table)
+        if self._chosen is not None:
+            others = [one for one in self._publishers.values() if one.number != self._chosen]
+            remarks += [f"left out, of another publisher: {other}" for other in others]
+        return tuple(remarks)
 
 
 def _require_possible(time_ns: int) -> None:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.config.import_description import Column, ImportDescription, PositionUnit
+from daq.config.import_description import ImportDescription, PositionUnit
 from daq.errors import TableUnfit
 from daq.log.conversion import unwrapped
-from daq.log.table import Table
+from daq.log.table import Table, section_place
 from ident.arrays import FloatArray, IntArray
 from ident.data.channel_faults import ChannelFault, ChannelKind, find_faults, mended, refused_fault
 from ident.data.fault_text import expected, found, remedy, what_is_done
@@ -35,8 +35,7 @@ class UsedRows:
     def place_of(self, fault: ChannelFault) -> str:
         """Name the number at which a fault begins, and its axis."""
         section = self.wanted.position if fault.quantity is ChannelKind.POSITION else self.wanted.current
-        columns: Sequence[Column] = section.columns
-        place = self.files[section.file].place(int(self.row[fault.first]), columns[fault.axis])
+        place = section_place(section, self.files, int(self.row[fault.first]), fault.axis)
         return f"{place}, axis {self.cell.axes[fault.axis].name}"
 
 

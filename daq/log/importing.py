@@ -7,7 +7,7 @@ without a rounding error of its own: raw = round(value / count).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
 from pathlib import Path
@@ -17,7 +17,9 @@ import numpy as np
 from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import (
+    Column,
     ImportDescription,
+    KeptPart,
     PositionUnit,
     ScaledColumns,
     Section,
@@ -26,7 +28,7 @@ from daq.config.import_description import (
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, TableUnfit
+from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
@@ -46,12 +48,15 @@ from daq.log.plausibility import (
     check_speed,
     check_steps,
     check_velocity,
+    counting_signs,
     in_si,
     require_changing,
+    signed_counts,
     warn_of_unsigned,
 )
 from daq.log.resampling import Clock, clock_of, on_clock
-from daq.log.table import Reader, Table
+from daq.log.ros1_bag import ROS_1_MAGIC
+from daq.log.table import ROW_MARGIN, Reader, Table, compare_stamps, rows_at_rate, section_values
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
@@ -71,10 +76,17 @@ class Imported:
     statistics: RunStatistics  #: of the log
     timing: Timing | None  #: what the time stamps showed; None without a time column
     remarks: tuple[str, ...]  #: oddities of the files that were mended
+    holdout: RunStatistics | None = None  #: of the log of the held-out part; None without one
 
 
 def import_recording(
-    description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None
+    description: Path,
+    data: Path,
+    out: Path,
+    *,
+    software: str,
+    cell_path: Path | None = None,
+    holdout: Path | None = None,
 ) -> Imported:
     """Convert the files that a description names to a log. The same input gives the same bytes: no clock is read.
 
@@ -84,13 +96,15 @@ def import_recording(
         out: the log to write; it does not exist after an error.
         software: name and version to put into the log.
         cell_path: cell file to use instead of the description's.
+        holdout: likewise, the log of the held-out part; None where the description has none.
 
     Raises:
         ConfigurationError: description or cell are wrong, or contradict each other.
         TableUnfit, PositionImplausible: the files cannot be used.
-        UsageError, OutputFailed: the log cannot be written.
+        UsageError, OutputFailed: a log cannot be written.
     """
     wanted = load_import(description)
+    _require_name_of_holdout(wanted, holdout)
     path = cell_path or description.parent / wanted.cell
     cell = load_cell(path)
     wanted = with_columns(wanted, data, cell.axis_names)
@@ -98,10 +112,8 @@ def import_recording(
     files = _read_tables(wanted, data)
     check_sizes(wanted, cell, files)
     recorded = _recorded(wanted, cell, files)
-    kept = recorded.kept
     rate_hz = recorded.used.rate_hz
     digests = {name: file.digest for name, file in files.items()}
-    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
     started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
     run = RunInfo(
         run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
@@ -114,19 +126,103 @@ def import_recording(
         origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
         timing=timing,
     )
-    content = LogContent.of(cell, run, bundle(path), kept.readback)
-    # A crash of an import loses no sample, so no clock is needed to flush in time.
-    with LogWriter(out, content, kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
-        stamp_ns = (started_ns + np.rint(np.arange(len(kept.counts)) * (1e9 / rate_hz)).astype(np.int64)).tolist()
-        silent = (0,) * len(cell.axes)
-        rows = zip(stamp_ns, kept.counts.tolist(), kept.current_raw.tolist(), strict=True)
-        for cycle, (time_ns, position_counts, current_raw) in enumerate(rows):
-            log.readings(_readings(slow, cycle, time_ns))
-            log.write(Sample(cycle, time_ns, tuple(position_counts), tuple(current_raw), silent))
-        log.conclude(valid=True)
+    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
+    samples = _LogSamples(cell, bundle(path), recorded.kept, slow, run, started_ns)
+    rows = range(len(recorded.kept.counts))
+    of_holdout = None
+    if wanted.holdout is None or holdout is None:
+        statistics = samples.write(out, rows)
+    else:
+        first = _first_of_holdout(wanted, wanted.holdout.from_s, rate_hz, len(rows))
+        of_holdout = samples.write(holdout, rows[first:])
+        try:
+            statistics = samples.write(out, rows[:first])
+        except BaseException:
+            holdout.unlink()
+            raise
     remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks += recorded.remarks
     remarks += fault_remarks(recorded.faults, recorded.used)
-    return Imported(log.statistics, timing, tuple(remarks))
+    return Imported(statistics, timing, tuple(remarks), of_holdout)
+
+
+def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) -> None:
+    """Refuse a description with a held-out part that has no name, and a name without such a part."""
+    if (wanted.holdout is None) == (holdout is None):
+        return
+    raise UsageError(
+        f"import description {wanted.name!r}",
+        found="`holdout`, and no name for the log of that part" if holdout is None else "no `holdout`",
+        expected="a name for the second log" if holdout is None else "`holdout: {from_s: SECONDS}`, the begin of it",
+        remedy="give `--holdout FILE`" if holdout is None else f"add it to the description, or leave out {holdout}",
+    )
+
+
+def _first_of_holdout(wanted: ImportDescription, from_s: float, rate_hz: float, count: int) -> int:
+    """Return the first sample of the held-out part.
+
+    Raises:
+        TableUnfit: one of the parts has too few samples.
+    """
+    first = ceil(from_s * rate_hz - ROW_MARGIN)
+    if FEWEST_ROWS <= first <= count - FEWEST_ROWS:
+        return first
+    raise TableUnfit(
+        f"import description {wanted.name!r}: holdout.from_s",
+        found=f"{from_s:g} s, of {count / rate_hz:.6g} s that are imported",
+        expected="a time in the recording, since its first sample",
+        remedy="correct `holdout`",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LogSamples:
+    """Samples of a recording, all of which or a part go into a log."""
+
+    cell: Cell
+    files: Mapping[str, bytes]  #: the cell's bundle
+    kept: Converted
+    slow: list[tuple[Quantity, int, FloatArray]]
+    run: RunInfo
+    started_ns: int
+
+    def write(self, out: Path, rows: range) -> RunStatistics:
+        """Write some samples into a new log.
+
+        Raises:
+            UsageError, OutputFailed: the log cannot be written.
+        """
+        step_ns = 1e9 / self.run.rate_hz
+        content = LogContent.of(self.cell, self._run_of(rows), self.files, self.kept.readback)
+        # A crash of an import loses no sample, so no clock is needed to flush in time.
+        with LogWriter(out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+            silent = (0,) * len(self.cell.axes)
+            counts = self.kept.counts[rows.start : rows.stop].tolist()
+            current_raw = self.kept.current_raw[rows.start : rows.stop].tolist()
+            for cycle, row in enumerate(rows):
+                time_ns = self.started_ns + round(row * step_ns)
+                log.readings(_readings(self.slow, row, time_ns))
+                log.write(Sample(cycle, time_ns, tuple(counts[cycle]), tuple(current_raw[cycle]), silent))
+            log.conclude(valid=True)
+        return log.statistics
+
+    def _run_of(self, rows: range) -> RunInfo:
+        """Return the facts about a part of the recording."""
+        if len(rows) == len(self.kept.counts):
+            return self.run
+        later_ns = round(rows.start * 1e9 / self.run.rate_hz)
+        wall_ns = self.run.started_wall_ns + later_ns if self.run.started_wall_ns else 0
+        timing = self.run.timing
+        if timing is not None and timing.started_s is not None:
+            timing = replace(timing, started_s=timing.started_s + later_ns * 1e-9)
+        return replace(
+            self.run,
+            run_id=f"{self.run.run_id}-{rows.start}-{rows.stop}",
+            started_wall_ns=wall_ns,
+            started_monotonic_ns=wall_ns,
+            origin=f"{self.run.origin}, samples {rows.start + 1} to {rows.stop}",
+            timing=timing,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +244,7 @@ class JudgedRecording:
     clock: Clock | None  #: None without a time column
     kept: Converted  #: what the log is to hold
     faults: tuple[ChannelFault, ...]  #: readings that are none
+    remarks: tuple[str, ...]  #: on what was mended besides
 
 
 def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> JudgedRecording:
@@ -156,13 +253,15 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     Raises:
         TableUnfit, PositionImplausible: the files cannot be used.
     """
-    table = files[wanted.position.file]
-    currents = files[wanted.current.file]
-    position = table.take(wanted.position.columns)
-    current = currents.take(wanted.current.columns)
-    require_changing(position, current, wanted, currents)
+    table = files[wanted.position.files[0]]
+    position = section_values(wanted.position, files)
+    current = section_values(wanted.current, files)
+    require_changing(position, current, wanted, files)
+    remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
-        check_counts(position, wanted, table)
+        position, remarks = signed_counts(position, wanted)
+        check_counts(position, wanted, files)
+    position = position * counting_signs(wanted.position.reversed, cell.axis_names)
     clock = None
     rate_hz = wanted.rate_hz
     row = np.arange(len(position))
@@ -173,15 +272,16 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
         row = clock.row
     assert rate_hz is not None  # load_import requires one of the two
     used = UsedRows(row, None if clock is None else clock.time_s, rate_hz, wanted, files, cell)
-    check_current(current, wanted, currents)
+    check_current(current, wanted, files)
     sound = sound_columns(position, current, used)
     kept = _converted(wanted, cell, position[row], current, clock)
     joint_rad = kept.joint_rad
-    check_limits(str(table.path), joint_rad, cell)
-    check_motion(str(table.path), joint_rad, cell)
-    check_steps(wanted, table, joint_rad, rate_hz, clock, cell)
+    subject = str(table.path) if len(wanted.position.files) == 1 else f"import description {wanted.name!r}"
+    check_limits(subject, joint_rad, cell)
+    check_motion(subject, joint_rad, cell)
+    check_steps(wanted, files, joint_rad, rate_hz, clock, cell)
     require_mendable(sound.faults, used, displaced=True)
-    check_speed(str(table.path), joint_rad, rate_hz, cell)
+    check_speed(subject, joint_rad, rate_hz, cell)
     check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
     current_a = kept.current_raw * kept.scale.current_per_unit
     warn_of_unsigned(wanted.name, joint_rad, current_a, rate_hz, cell)
@@ -189,7 +289,7 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     if sound.faults and is_resampled:
         # Where rows stay as they are, a fit mends them; a spline would spread what is wrong.
         kept = _converted(wanted, cell, sound.position[row], sound.current, clock)
-    return JudgedRecording(used, clock, kept, sound.faults)
+    return JudgedRecording(used, clock, kept, sound.faults, remarks)
 
 
 def _converted(
@@ -213,10 +313,21 @@ def _converted(
 
 def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     """Read every file of the description with the reader of its kind."""
-    tables = {}
-    for name, columns in wanted.files().items():
+    part = wanted.keep
+    if part is not None and part.is_by_time and wanted.rate_hz is not None:
+        wanted = wanted.model_copy(update={"keep": _part_of_rows(rows_at_rate(wanted.rate_hz, part))})
+    read: dict[str, Table] = {}
+    # The file with the stamps comes first: where times are kept, it says which rows of the others these are.
+    files = wanted.files()
+    for name in sorted(files, key=lambda one: wanted.time is None or one != wanted.time.file):
         time = wanted.time if wanted.time is not None and wanted.time.file == name else None
-        tables[name] = reader_of(data / name)(data / name, wanted, columns, time)
+        path = data / name
+        table = reader_of(path)(path, wanted, files[name], time)
+        read[name] = table
+        if time is not None and part is not None and part.is_by_time:
+            rows = slice(table.first_row, table.first_row + len(table.values))
+            wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
+    tables = {name: read[name] for name in files}
     if len({len(file.values) for file in tables.values()}) > 1:
         raise TableUnfit(
             ", ".join(str(file.path) for file in tables.values()),
@@ -224,7 +335,11 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
-    position = tables[wanted.position.file]
+    if wanted.time is not None:
+        timed = tables[wanted.time.file]
+        for name, table in tables.items():
+            tables[name] = replace(table, remarks=(*table.remarks, *compare_stamps(timed, table)))
+    position = tables[wanted.position.files[0]]
     if len(position.values) < FEWEST_ROWS:
         raise TableUnfit(
             str(position.path),
@@ -235,6 +350,11 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     return tables
 
 
+def _part_of_rows(rows: slice) -> KeptPart:
+    """Return the part of a recording that has these rows, counted from 0."""
+    return KeptPart(from_row=rows.start + 1, to_row=rows.stop)
+
+
 def _slow(
     wanted: ImportDescription, cell: Cell, files: dict[str, Table], clock: Clock | None, rate_hz: float
 ) -> list[tuple[Quantity, int, FloatArray]]:
@@ -242,12 +362,12 @@ def _slow(
     found = []
     if (torque := wanted.torque) is not None:
         factors = np.array(torque.factors(cell.axis_names))
-        values = on_clock(files[torque.file].take(torque.columns), clock) * factors
+        values = on_clock(section_values(torque, files), clock) * factors
         if torque.side is Side.JOINT:
             values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
         found.append((Quantity.TORQUE, max(1, round(rate_hz / TORQUE_HZ)), values))
     if (temperature := wanted.temperature) is not None:
-        values = on_clock(files[temperature.file].take(temperature.columns), clock)
+        values = on_clock(section_values(temperature, files), clock)
         found.append((Quantity.TEMPERATURE, max(1, round(rate_hz / TEMPERATURE_HZ)), values))
     return found
 
@@ -330,7 +450,8 @@ def _check_columns(wanted: ImportDescription, description: Path) -> None:
     read: dict[tuple[Path, str], str] = {}
     timed = [] if wanted.time is None else [("time.column", wanted.time.file, wanted.time.column)]
     for key, section in wanted.sections():
-        timed += [(f"{key}.columns[{index}]", section.file, column) for index, column in enumerate(section.columns)]
+        places = enumerate(section.places)
+        timed += [(f"{key}.columns[{index}]", file, column) for index, (file, column) in places]
     for key, file, column in timed:
         first = read.setdefault((Path(file), str(column)), key)
         if first != key:
@@ -346,12 +467,20 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     n = len(cell.axes)
     _check_columns(wanted, description)
     for key, section in wanted.sections():
-        if len(section.columns) != n:
+        if len(section.places) != n:
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",
-                found=f"{len(section.columns)} columns",
+                found=f"{len(section.places)} columns",
                 expected=f"{n}, one for each axis of cell {cell.name!r}",
                 remedy="correct the description, or choose the cell with --cell",
+            )
+        others = [name for name in getattr(section, "reversed", ()) if name not in cell.axis_names]
+        if others:
+            raise ConfigurationInconsistent(
+                f"{description}: {key}.reversed",
+                found=", ".join(others),
+                expected=f"some of {', '.join(cell.axis_names)}",
+                remedy="name axes of the cell, or correct the cell with --cell",
             )
         if isinstance(section, ScaledColumns) and section.factors(cell.axis_names) is None:
             raise ConfigurationInconsistent(
@@ -360,11 +489,19 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 expected=f"one for each of {', '.join(cell.axis_names)}",
                 remedy="write a number for all axes, a list in their order, or a mapping from their names",
             )
-    for axis in cell.axes:
-        if axis.gain_unit not in {f"Nm/{wanted.current.unit}", f"N/{wanted.current.unit}"}:
+    units = wanted.current.units(cell.axis_names)
+    if units is None:
+        raise ConfigurationInconsistent(
+            f"{description}: current.unit",
+            found=str(wanted.current.unit),
+            expected=f"one for each of {', '.join(cell.axis_names)}",
+            remedy="write a unit for all axes, a list in their order, or a mapping from their names",
+        )
+    for axis, unit in zip(cell.axes, units, strict=True):
+        if axis.gain_unit not in {f"Nm/{unit}", f"N/{unit}"}:
             raise ConfigurationInconsistent(
                 f"{description}: current.unit",
-                found=f"{wanted.current.unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
+                found=f"{unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
                 expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
@@ -388,33 +525,29 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     _payload(wanted, cell)
 
 
+def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:
+    """Return file and column, of a bag file and field."""
+    file, column = place
+    name = str(column)
+    return Path(file), name.partition(".")[0] if file in bags else name
+
+
 _HEADS: dict[bytes, Reader] = {
     MAGIC: read_bag,
     SQLITE_MAGIC: read_bag,
+    ROS_1_MAGIC: read_bag,
     ZSTD_MAGIC: read_bag,
     b"MATLAB ": read_mat,
     b"\x89HDF\r\n": read_mat,
 }
-_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".mat": read_mat}
-_ROS_1_BAG = b"#ROSBAG V"
+_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".bag": read_bag, ".mat": read_mat}
 
 
 def reader_of(path: Path) -> Reader:
-    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not.
-
-    Raises:
-        TableUnfit: the content is of a format that is not read.
-    """
+    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not."""
     if path.is_dir():
         return read_bag
     head = first_bytes(path)
-    if head.startswith(_ROS_1_BAG):
-        raise TableUnfit(
-            str(path),
-            found="a ROS 1 bag",
-            expected="CSV, a MATLAB file or a ROS 2 bag",
-            remedy="convert it to a ROS 2 bag: `rosbags-convert`",
-        )
     by_content = next((reader for start, reader in _HEADS.items() if head.startswith(start)), None)
     return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
 
@@ -432,43 +565,59 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
     changed: dict[str, Section] = {}
     bags = set[str]()
     for key, section in wanted.sections():
-        reader = reader_of(data / section.file)
-        if reader is read_bag:
-            if isinstance(section, TemperatureColumns):
-                raise TableUnfit(
-                    str(data / section.file),
-                    found="`temperature` from a ROS 2 bag",
-                    expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
-                    remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
-                )
-            bags.add(section.file)
-            field = key if key in FIELDS else "effort"
-            names = [str(column) for column in section.columns]
-            if len(names) == 1 and names[0] in FIELDS:
-                names = [f"{names[0]}.{axis}" for axis in axis_names]
-            columns = [name if name.partition(".")[0] in FIELDS else f"{field}.{name}" for name in names]
-            changed[key] = replace(section, columns=tuple(columns))
-        elif reader is read_mat and len(section.columns) == 1 < len(axis_names):
-            columns = [f"{section.columns[0]}.{number + 1}" for number in range(len(axis_names))]
-            changed[key] = replace(section, columns=tuple(columns))
+        readers = {file: reader_of(data / file) for file in section.files}
+        bags |= {file for file, reader in readers.items() if reader is read_bag}
+        if isinstance(section, TemperatureColumns) and bags.intersection(section.files):
+            raise TableUnfit(
+                str(data / section.files[0]),
+                found="`temperature` from a ROS 2 bag",
+                expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
+                remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
+            )
+        places = section.places
+        if len(places) == 1 < len(axis_names):
+            places = _of_all_axes(places[0], readers, axis_names)
+        field = key if key in FIELDS else "effort"
+        columns = [_of_field(column, field) if file in bags else column for file, column in places]
+        files: str | tuple[str, ...] = section.file
+        if isinstance(files, tuple):
+            files = tuple(file for file, _ in places)
+        changed[key] = replace(section, file=files, columns=tuple(columns))
     whole = wanted.model_copy(update=changed)
     _check_torque(whole, bags)
     return whole
 
 
+def _of_all_axes(
+    place: tuple[str, Column], readers: Mapping[str, Reader], axis_names: Sequence[str]
+) -> tuple[tuple[str, Column], ...]:
+    """Return the place of each axis, where one column may name all of them: a field of a bag, or a matrix."""
+    file, column = place
+    if readers[file] is read_bag and column in FIELDS:
+        return tuple((file, f"{column}.{axis}") for axis in axis_names)
+    if readers[file] is read_mat:
+        return tuple((file, f"{column}.{number + 1}") for number in range(len(axis_names)))
+    return (place,)
+
+
+def _of_field(column: Column, field: str) -> str:
+    """Return the column of a bag that a joint, or a field and a joint, name."""
+    name = str(column)
+    return name if name.partition(".")[0] in FIELDS else f"{field}.{name}"
+
+
 def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
     """Refuse torques from the columns, or from the field of a bag, of the currents: their slope would be made up."""
-    torque, current = wanted.torque, wanted.current
-    if torque is None or Path(torque.file) != Path(current.file):
+    if wanted.torque is None:
         return
-    found, read = (
-        [str(column).partition(".")[0] if torque.file in bags else column for column in section.columns]
-        for section in (torque, current)
-    )
-    if shared := [str(column) for column in dict.fromkeys(found) if column in read]:
+    read = {_source(place, bags) for place in wanted.current.places}
+    shared = dict.fromkeys(place for place in wanted.torque.places if _source(place, bags) in read)
+    if shared:
+        names = dict.fromkeys(_source(place, bags)[1] for place in shared)
+        files = dict.fromkeys(file for file, _ in shared)
         raise ConfigurationInconsistent(
             f"import description {wanted.name!r}: torque.columns",
-            found=f"{', '.join(shared)} of {torque.file}, which current is read from",
+            found=f"{', '.join(names)} of {', '.join(files)}, which current is read from",
             expected="the controller's own torque, in columns (of a bag: in a field) of its own",
             remedy="name those columns, or leave `torque` out; no fit needs it",
         )

@@ -28,12 +28,17 @@ from daq.log.table import (
     Stamps,
     Table,
     check_reach,
+    counter_wraps,
+    cut_stamps,
     digest_of,
     repeated,
     require_finite,
+    require_kept,
+    rows_in_time,
     stamps_of_ns,
     stamps_of_numbers,
     unreadable,
+    without_wraps,
 )
 
 MAGIC = b"MATLAB 5.0 MAT-file"
@@ -54,14 +59,14 @@ _KINDS = {
 _COMPLEX = 0x0800
 
 
-def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+def read_mat(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
     """Read columns of a MATLAB file.
 
     Raises:
         TableUnfit: the file cannot be read, is of another format, a variable is missing or holds no real numbers, or
             the columns are of different lengths.
     """
-    if time is not None and time.unit is TimeUnit.ISO_8601:
+    if time is not None and time.unit.is_text:
         raise TableUnfit(
             str(path),
             found=f"time column {time.column!r} in {time.unit.value}",
@@ -81,19 +86,38 @@ def read_mat(path: Path, _wanted: ImportDescription, columns: tuple[Column, ...]
     begun = [numbers.ctypes.data for numbers in found]  # they are views of what was read
     if twice := [name for index, name in enumerate(names) if begun[index] in begun[:index]]:
         raise repeated(path, twice[0], "under another name")
-    values = require_finite(Table(path, names, np.column_stack([one.astype(np.float64) for one in found]), "")).values
-    values = values[:, : len(columns)]
-    clock = None if time is None else _stamps(path, found[-1], time)
-    return Table(path, columns, values, digest_of(values, clock), clock)
+    part = wanted.keep
+    rows = slice(None) if part is None else part.rows
+    require_kept(path, len(found[0]), rows)
+    clock = None
+    remarks: tuple[str, ...] = ()
+    if time is not None:
+        stamps = found[-1][rows]
+        require_finite(Table(path, (time.column,), stamps.astype(np.float64)[:, None], "", first_row=rows.start or 0))
+        clock, remarks = _stamps(path, stamps, time)
+        if part is not None and part.is_by_time:
+            rows = rows_in_time(clock, part)
+            require_kept(path, len(stamps), rows)
+            clock = cut_stamps(clock, rows)
+    first_row, end, _ = rows.indices(len(found[0]))
+    values = np.empty((end - first_row, len(columns)))
+    for index in range(len(columns)):
+        values[:, index] = found[index][rows]
+    table = Table(path, columns, values, digest_of(values, clock), clock, first_row=first_row, remarks=remarks)
+    return require_finite(table)
 
 
-def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> Stamps:
+def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> tuple[Stamps, tuple[str, ...]]:
+    """Return the stamps of a column, and remarks on them."""
     factor = round(time.unit.seconds * 1e9)
     seconds = values.astype(np.float64) * time.unit.seconds
     check_reach(seconds, lambda row: f"{path}, row {row + 1}, column {time.column}")
+    whole_s, remarks = without_wraps(seconds, counter_wraps())
+    if remarks:
+        return stamps_of_numbers(whole_s, TimeUnit.SECOND), tuple(f"{path.name}: {remark}" for remark in remarks)
     if values.dtype.kind in "iu":
-        return stamps_of_ns((values.astype(np.int64) * factor).tolist())
-    return stamps_of_numbers(values.astype(np.float64), time.unit)
+        return stamps_of_ns((values.astype(np.int64) * factor).tolist()), ()
+    return stamps_of_numbers(values.astype(np.float64), time.unit), ()
 
 
 def _content(path: Path) -> memoryview:

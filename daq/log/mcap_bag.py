@@ -28,6 +28,7 @@ class Topic:
 
     name: str  #: as publishers know it
     has_joint_states: bool  #: in CDR
+    publisher: str = ""  #: name of the node, where the bag has it (ROS 1)
 
 
 class BagMessage(NamedTuple):
@@ -134,6 +135,7 @@ class JointState:
     """A message of the type sensor_msgs/msg/JointState; a field without values is empty."""
 
     stamp_ns: int  #: of its header
+    frame: str  #: of its header
     names: tuple[str, ...]  #: names of n joints
     position: tuple[float, ...]  #: [rad; m for a prismatic joint], shape (n,)
     velocity: tuple[float, ...]  #: per second, shape (n,)
@@ -177,12 +179,12 @@ def joint_state_from_cdr(data: bytes) -> JointState:
 
     try:
         seconds, nanoseconds = struct.unpack_from(order + "iI", body)
-        text()  # the frame
+        frame = text()
         count = unsigned()
         if count > len(body):
             raise ValueError(f"{count} names in {len(body)} bytes")
         names = tuple([text() for _ in range(count)])
-        return JointState(seconds * 1_000_000_000 + nanoseconds, names, numbers(), numbers(), numbers())
+        return JointState(seconds * 1_000_000_000 + nanoseconds, frame, names, numbers(), numbers(), numbers())
     except struct.error as error:
         raise ValueError(f"a message of {len(data)} bytes ({error})") from error
 

@@ -8,6 +8,7 @@ none (`daq.log.column_faults`).
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from math import pi
 
 import numpy as np
@@ -26,7 +27,7 @@ from daq.config.import_description import (
 from daq.errors import PositionImplausible, TableUnfit
 from daq.log.impossible import fastest_speeds, impossible_current, impossible_speed, impossible_step
 from daq.log.resampling import Clock, on_clock
-from daq.log.table import Table
+from daq.log.table import Table, section_place, section_values
 from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.data.unsigned_current import require_signed_currents
@@ -34,6 +35,7 @@ from ident.errors import CurrentUnsigned
 
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
+LARGEST_UNSIGNED = 2**32 - 1
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
@@ -46,8 +48,9 @@ STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the
 def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> None:
     """Refuse numbers that no robot has in any unit: the file is damaged, or a column is another."""
     for key, section in wanted.sections():
-        table, size = files[section.file], LARGEST_NUMBER
-        values, least, largest = table.take(section.columns), -size, size
+        least = -LARGEST_NUMBER
+        largest = LARGEST_NUMBER
+        values = section_values(section, files)
         if isinstance(section, TemperatureColumns):
             least, largest = TEMPERATURES_C
         if isinstance(section, ScaledColumns):
@@ -57,24 +60,50 @@ def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) 
         if wrong.size:
             row, column = wrong[0].tolist()
             raise TableUnfit(
-                table.place(row, section.columns[column]),
+                section_place(section, files, row, column),
                 found=f"{values[row, column]:g}, as {key}",
                 expected=f"from {least:g} to {largest:g}",
                 remedy="correct the number, or the columns or the factor of that section in the import description",
             )
 
 
-def check_counts(position: FloatArray, wanted: ImportDescription, file: Table) -> None:
+def check_counts(position: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]) -> None:
     """Refuse counts that are no whole numbers of 32 bits."""
     wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
     if wrong.size:
         row, column = wrong[0].tolist()
         raise TableUnfit(
-            file.place(row, wanted.position.columns[column]),
+            section_place(wanted.position, files, row, column),
             found=f"{position[row, column]!r}",
             expected="a whole number of encoder counts of at most 31 bits",
             remedy="correct `unit` in the import description",
         )
+
+
+def signed_counts(position: FloatArray, wanted: ImportDescription) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return counts with a sign where a column has them of 32 bits without: the same counter, read as a drive does.
+
+    Args:
+        position: as the file has it, shape (rows, n).
+        wanted: with the columns of the positions.
+
+    Returns:
+        position, shape (rows, n), and a remark for each column that was changed.
+    """
+    signed = position.copy()
+    remarks = []
+    for index, (_, column) in enumerate(wanted.position.places):
+        counts = position[:, index]
+        is_unsigned = counts.min() >= 0.0 and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
+        if is_unsigned:
+            signed[counts > LARGEST_RAW, index] -= LARGEST_UNSIGNED + 1.0
+            remarks.append(f"column {column}: counts of 32 bits without a sign, read as counts with one")
+    return signed, tuple(remarks)
+
+
+def counting_signs(reversed_axes: Sequence[str], axes: Sequence[str]) -> FloatArray:
+    """Return −1 for each axis that counts the other way in a file, 1 for the others, shape (n,)."""
+    return np.array([-1.0 if axis in reversed_axes else 1.0 for axis in axes])
 
 
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
@@ -99,7 +128,8 @@ def check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
     if (velocity := wanted.velocity) is None:
         return
-    stated = in_si(on_clock(files[velocity.file].take(velocity.columns), clock), velocity, cell)
+    of_file = section_values(velocity, files) * counting_signs(velocity.reversed, cell.axis_names)
+    stated = in_si(on_clock(of_file, clock), velocity, cell)
     if velocity.side is Side.MOTOR:
         stated = stated @ np.linalg.inv(cell.ratio).T
     step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)
@@ -111,8 +141,9 @@ def check_velocity(
     for index in np.flatnonzero(error > velocity.tolerance * size + still).tolist():
         way, stated_way = moved[:, index], expected[:, index]
         ratio = float(way @ stated_way) / max(float(stated_way @ stated_way), 1e-300)
+        file, column = velocity.places[index]
         raise TableUnfit(
-            f"{files[velocity.file].path}, column {velocity.columns[index]}, axis {cell.axes[index].name}",
+            f"{files[file].path}, column {column}, axis {cell.axes[index].name}",
             found=f"positions that move {ratio:.3g} times as fast as this velocity says, and differ from it by "
             f"{100.0 * float(error[index]) / max(float(size[index]), 1e-300):.3g} %",
             expected=f"velocities that agree with the positions to {100.0 * velocity.tolerance:g} %",
@@ -121,34 +152,37 @@ def check_velocity(
         )
 
 
-def require_changing(position: FloatArray, current: FloatArray, wanted: ImportDescription, file: Table) -> None:
+def require_changing(
+    position: FloatArray, current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
+) -> None:
     """Refuse a current of one value, unless the position of its axis does not change either.
 
     Args:
         position, current: as their files have them, shape (rows, n).
         wanted: with the columns of the currents.
-        file: the file that they are in.
+        files: the tables, by the name of their file.
 
     Raises:
         TableUnfit: a current has one value while its axis moves.
     """
-    for index, column in enumerate(wanted.current.columns):
+    for index, (file, column) in enumerate(wanted.current.places):
         is_constant = len(current) > 1 and not np.ptp(current[:, index])
         if is_constant and np.ptp(position[:, index]):
             raise TableUnfit(
-                f"{file.path}, column {column}",
+                f"{files[file].path}, column {column}",
                 found=f"{current[0, index]:g} in every row" if current[0, index] else "zero in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
 
 
-def check_current(current: FloatArray, wanted: ImportDescription, file: Table) -> None:
+def check_current(current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]) -> None:
     """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
     found = impossible_current(current)
     if found is not None:
-        place = file.place(found.row, wanted.current.columns[found.axis])
-        raise found.error(TableUnfit, place, "samples are never invented: cut the recording there, or export it again")
+        place = section_place(wanted.current, files, found.row, found.axis)
+        remedy = "samples are never invented: cut the recording there, by `keep`, or export it again"
+        raise found.error(TableUnfit, place, remedy)
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
@@ -171,13 +205,18 @@ def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) ->
 
 
 def check_steps(
-    wanted: ImportDescription, file: Table, joint_rad: FloatArray, rate_hz: float, clock: Clock | None, cell: Cell
+    wanted: ImportDescription,
+    files: Mapping[str, Table],
+    joint_rad: FloatArray,
+    rate_hz: float,
+    clock: Clock | None,
+    cell: Cell,
 ) -> None:
     """Refuse a step between two samples that no motor makes: a lost or doubled row, an angle or a counter that wraps.
 
     Args:
         wanted: with the columns of the positions.
-        file: the file that they are in.
+        files: the tables, by the name of their file.
         joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
         rate_hz: rate of the samples.
         clock: of the file's time column; None without one.
@@ -191,9 +230,10 @@ def check_steps(
         row = int(clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)])
     raise found.error(
         TableUnfit,
-        f"{file.place(row, wanted.position.columns[found.axis])}, axis {cell.axes[found.axis].name}",
-        "cut the recording there, or export it again; a column that wraps (at 360 degrees, at a turn of "
-        "the motor, as a counter) has to be made continuous",
+        f"{section_place(wanted.position, files, row, found.axis)}, axis {cell.axes[found.axis].name}",
+        "cut the recording there, by `keep` of the import description, or export it again; a column that wraps (at 360 "
+        "degrees, at a turn of the motor, as a counter) has to be made continuous; in a bag, do two nodes publish the "
+        "same joints on the topic?",
     )
 
 

@@ -203,9 +203,10 @@ def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArra
             if back_s
             else "the stamp of the row above, with other numbers",
             expected="stamps that increase",
-            remedy="were two recordings joined? cut them apart"
+            remedy="were two recordings joined? import each by `keep` of the import description"
             if back_s
-            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time",
+            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time; in a bag, do "
+            "two nodes publish the same joints on the topic?",
         )
     return np.concatenate(([True], ~repeated))
 
@@ -221,6 +222,6 @@ def _check_gaps(table: Table, wanted: TimeColumn, row: IntArray, time_s: FloatAr
             found=f"{step_s[first]:.6g} s after the sample before"
             + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
             expected=f"at most {wanted.largest_gap_periods:g} times the usual {timing.usual_step_s:.6g} s",
-            remedy="samples are missing: import the parts before and after it as two recordings, or allow the gap with "
-            "`largest_gap_periods` of `time`; if these are times of arrival, give rate_hz instead of time",
+            remedy="samples are missing: import the parts before and after it as two recordings, by `keep`, or allow "
+            "the gap with `largest_gap_periods` of `time`; if these are times of arrival, give rate_hz instead of time",
         )

@@ -7,16 +7,21 @@ names in that file. It returns a `Table`, or raises `TableUnfit`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import ceil, floor, inf
 from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, reason_of
+from daq.config.import_description import Column, ImportDescription, KeptPart, Section, TimeColumn, TimeUnit
+from daq.errors import TableUnfit, counted, reason_of
 from ident.arrays import FloatArray
 
+TIME_MARGIN_S = 1e-9  #: Stamps so near to an end of the part that is kept are in it
+ROW_MARGIN = 1e-6  #: Likewise, in rows
+COUNTER_BITS = (16, 32)  #: Of counters of time
+LONGEST_WRAP_STEP = 3.0  #: Longest step over the end of a counter, in usual steps
 LATEST_NS = 9 * 10**18  #: The latest stamp that a log holds, roughly
 
 
@@ -37,8 +42,11 @@ class Table:
     values: FloatArray  #: finite numbers, shape (k, len(columns))
     digest: str  #: of the rows (sha256, hex)
     stamps: Stamps | None = None  #: of the time column; None if it is not in this file
-    first_line: int | None = None  #: line of the first row, from 1; None where rows have no lines
+    line_numbers: Sequence[int] | None = None  #: line of each row, from 1; None where rows have no lines
+    first_row: int = 0  #: rows of the file that were cut off before the first one
     remarks: tuple[str, ...] = ()  #: oddities of the file that were mended, for the person who imports it
+    #: Of a column that is called as the time column of another file; None without one.
+    stamps_beside: Stamps | None = None
 
     def take(self, columns: Sequence[Column]) -> FloatArray:
         """Return some of the columns, shape (k, len(columns))."""
@@ -46,8 +54,55 @@ class Table:
 
     def place(self, row: int, column: Column) -> str:
         """Name a number in a message: `run.csv:42, column i3`."""
-        at = f", row {row + 1}" if self.first_line is None else f":{self.first_line + row}"
-        return f"{self.path}{at}, column {column}"
+        if self.line_numbers is None:
+            return f"{self.path}, row {self.first_row + row + 1}, column {column}"
+        return f"{self.path}:{self.line_numbers[row]}, column {column}"
+
+
+def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
+    """Compare the rows of two files that both have stamps: a row of one belongs to the same row of the other.
+
+    Args:
+        timed: with the stamps that are used.
+        other: with `stamps_beside`, or without.
+
+    Returns:
+        a remark where one of them begins later.
+
+    Raises:
+        TableUnfit: the steps differ: a row is missing in one of them.
+    """
+    mine = timed.stamps
+    others = other.stamps_beside
+    if mine is None or others is None or len(mine.time_s) != len(others.time_s) or len(mine.time_s) < 2:
+        return ()
+    half_step_s = 0.5 * float(np.median(np.diff(mine.time_s)))
+    apart = np.flatnonzero(np.abs(mine.time_s - others.time_s) > half_step_s)
+    if apart.size:
+        row = int(apart[0])
+        raise TableUnfit(
+            other.place(row, "time"),
+            found=f"{others.time_s[row]:.6g} s since its first row, and {mine.time_s[row]:.6g} s in {timed.path.name}",
+            expected="rows of the same instants in both files",
+            remedy="a row is missing in one of them, or they are of different runs; export them again",
+        )
+    later_s = 1e-9 * (others.first_ns - mine.first_ns)
+    if abs(later_s) <= half_step_s:
+        return ()
+    name = other.path.name
+    return (f"{name}: its stamps begin {later_s:.6g} s after those of {timed.path.name}: rows count as simultaneous",)
+
+
+def section_values(section: Section, files: Mapping[str, Table]) -> FloatArray:
+    """Return the columns of a section, shape (k, number of axes)."""
+    columns = [files[file].take((column,)) for file, column in section.places]
+    return np.hstack(columns)
+
+
+def section_place(section: Section, files: Mapping[str, Table], row: int, axis: int) -> str:
+    """Name a number of a section in a message."""
+    file, column = section.places[axis]
+    return files[file].place(row, column)
 
 
 Reader = Callable[[Path, ImportDescription, tuple[Column, ...], TimeColumn | None], Table]
@@ -119,9 +174,129 @@ def require_finite(table: Table) -> Table:
             table.place(row, table.columns[column]),
             found=str(table.values[row, column]),
             expected="a finite number",
-            remedy="samples are never invented: cut the recording there, or export it again",
+            remedy=cut_advice(table.values, table.first_row),
         )
     return table
+
+
+def cut_advice(values: FloatArray, first_row: int) -> str:
+    """Say which rows to keep of a table in which numbers are not finite.
+
+    Args:
+        values: shape (k, n).
+        first_row: rows of the file that were cut off before the first one.
+    """
+    sound = np.asarray(np.isfinite(values).all(axis=1))
+    first = int(np.argmax(sound)) if sound.any() else 0
+    last = len(sound) - int(np.argmax(sound[::-1]))
+    if not sound[first:last].all():
+        last = first + int(np.argmin(sound[first:last]))
+    ends = []
+    if first > 0:
+        ends.append(f"from_row: {first_row + first + 1}")
+    if last < len(sound):
+        ends.append(f"to_row: {first_row + last}")
+    setting = f"`keep: {{{', '.join(ends)}}}`" if ends and sound.any() else "`keep`"
+    cut = f"cut the recording there, by {setting} of the import description"
+    return f"samples are never invented: {cut}, or export it again"
+
+
+def rows_in_time(stamps: Stamps, part: KeptPart) -> slice:
+    """Return the rows of the times that are kept."""
+    from_s = part.from_s or 0.0
+    to_s = inf if part.to_s is None else part.to_s
+    is_inside = (stamps.time_s >= from_s - TIME_MARGIN_S) & (stamps.time_s <= to_s + TIME_MARGIN_S)
+    inside = np.flatnonzero(is_inside)
+    if not inside.size:
+        return slice(0, 0)
+    return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
+def require_kept(path: Path, count: int, rows: slice) -> None:
+    """Refuse a part of a recording in which there is nothing.
+
+    Args:
+        path: of the file.
+        count: rows that it has.
+        rows: that are kept.
+
+    Raises:
+        TableUnfit: there are none of them.
+    """
+    if not range(count)[rows]:
+        raise TableUnfit(
+            str(path),
+            found=f"{counted(count, 'row')}, none of them in `keep`",
+            expected="a row for each sample of a motion",
+            remedy="correct `keep` in the import description",
+        )
+
+
+def rows_at_rate(rate_hz: float, part: KeptPart) -> slice:
+    """Return the rows of the times that are kept, where a rate is stated in the place of stamps."""
+    first = ceil((part.from_s or 0.0) * rate_hz - ROW_MARGIN)
+    if part.to_s is None:
+        return slice(first, None)
+    return slice(first, floor(part.to_s * rate_hz + ROW_MARGIN) + 1)
+
+
+def cut_stamps(stamps: Stamps, rows: slice) -> Stamps:
+    """Return the stamps of some rows."""
+    time_s = stamps.time_s[rows]
+    if not time_s.size:
+        return Stamps(time_s, stamps.first_ns)
+    return Stamps(time_s - time_s[0], stamps.first_ns + round(float(time_s[0]) * 1e9))
+
+
+@dataclass(frozen=True, slots=True)
+class Wrap:
+    """A way in which stamps begin anew."""
+
+    period_s: float
+    name: str  #: for a remark
+
+
+def counter_wraps() -> tuple[Wrap, ...]:
+    """Return how counters of 16 and 32 bits wrap, of any unit of time."""
+    found: list[Wrap] = []
+    for unit in (TimeUnit.SECOND, TimeUnit.MILLISECOND, TimeUnit.MICROSECOND, TimeUnit.NANOSECOND):
+        found += [
+            Wrap(2.0**bits * unit.seconds, f"a counter of {bits} bits in {unit.value} that wraps")
+            for bits in COUNTER_BITS
+        ]
+    return tuple(found)
+
+
+MIDNIGHT = Wrap(86400.0, "times of day that pass midnight")
+
+
+def without_wraps(time_s: FloatArray, wraps: Sequence[Wrap]) -> tuple[FloatArray, tuple[str, ...]]:
+    """Make stamps continuous that begin anew, as a counter of 32 bits does; others stay as they are.
+
+    Each step back must be nearly a whole period: with it, the step is as long as the others.
+
+    Args:
+        time_s: stamps [s], shape (k,).
+        wraps: what may have happened; the first one that explains every step back is taken.
+
+    Returns:
+        stamps, shape (k,), and a remark if they were changed.
+    """
+    step_s = np.diff(time_s)
+    is_back = step_s < 0.0
+    forward_s = step_s[step_s > 0.0]
+    if not is_back.any() or not forward_s.size:
+        return time_s, ()
+    longest_s = LONGEST_WRAP_STEP * float(np.median(forward_s))
+    for wrap in wraps:
+        mended_s = step_s[is_back] + wrap.period_s
+        is_explained = np.all((mended_s > 0.0) & (mended_s <= longest_s))
+        if is_explained and np.ptp(time_s) <= wrap.period_s:
+            whole_s = np.where(is_back, step_s + wrap.period_s, step_s)
+            times = counted(int(np.count_nonzero(is_back)), "time")
+            remark = f"stamps begin anew {times}: taken as {wrap.name}, and made continuous"
+            return np.concatenate((time_s[:1], time_s[0] + np.cumsum(whole_s))), (remark,)
+    return time_s, ()
 
 
 def digest_of(values: FloatArray, stamps: Stamps | None) -> str:

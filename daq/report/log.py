@@ -126,6 +126,13 @@ class InfoReport(Report):
     """size of each [bytes]"""
 
 
+class HoldoutLog(Report):
+    """The log of the held-out part of an import."""
+
+    log: str
+    samples: int
+
+
 class ImportReport(NewLog):
     """`import`."""
 
@@ -133,6 +140,7 @@ class ImportReport(NewLog):
     wall_minus_monotonic_ns: int | None
     timing: StampSummary | None
     remarks: list[str]
+    holdout: HoldoutLog | None
 
 
 class SalvageReport(Report):
@@ -193,9 +201,12 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
     )
 
 
-def import_report(path: Path, imported: Imported) -> ImportReport:
-    """Return the log of an import with its losses, and what was found out of its time stamps."""
-    return ImportReport.of(imported.statistics, imported, log=path)
+def import_report(path: Path, imported: Imported, holdout: Path | None = None) -> ImportReport:
+    """Return the log of an import with its losses, what its time stamps show, and the log of its held-out part."""
+    held_out = None
+    if imported.holdout is not None:
+        held_out = HoldoutLog(log=str(holdout), samples=imported.holdout.samples)
+    return ImportReport.of(imported.statistics, imported, log=path, holdout=held_out)
 
 
 def salvage_report(path: Path, saved: Salvaged) -> SalvageReport:

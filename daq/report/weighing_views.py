@@ -135,7 +135,8 @@ NOISE_ROWS = 4.0
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
     body = found.body
-    carrier = "flange" if found.cell.chain is None else "platform"
+    is_last = found.cell.chain is None and found.cell.platform is None
+    carrier = "flange" if is_last else "platform"
     nothing = _shows_nothing(body)
     turns = not np.isnan(body.values[:-1]).all()
     shown = turns and not nothing
@@ -212,23 +213,23 @@ def _doubts(found: Weighed) -> Iterator[str]:
 
 def carrier_text(cell: Cell) -> str:
     """Name the joint whose frame the parameters of a payload are in, and where the platform's link is in it."""
-    if cell.chain is None:
+    if cell.chain is None and cell.platform is None:
         return "the last joint"
     robot = robot_of(cell)
     name = f"the joint {robot.joints[robot.carrier].name}"
-    if cell.chain.platform is None:
+    if cell.platform is None:
         return name
-    x, y, z = 1000.0 * read_urdf(cell.urdf).links[cell.chain.platform].translation_m
-    return f"{name}, in which the link {cell.chain.platform} is at ({x:.4g}, {y:.4g}, {z:.4g}) mm"
+    x, y, z = 1000.0 * read_urdf(cell.urdf).links[cell.platform].translation_m
+    return f"{name}, in which the link {cell.platform} is at ({x:.4g}, {y:.4g}, {z:.4g}) mm"
 
 
 def _platform(cell: Cell) -> tuple[str, Place] | None:
     """Platform's link and its frame in that of the joint that carries it; None where it is that joint's frame."""
-    if cell.chain is None or cell.chain.platform is None:
+    if cell.platform is None:
         return None
-    frame = read_urdf(cell.urdf).links[cell.chain.platform]
+    frame = read_urdf(cell.urdf).links[cell.platform]
     same = np.allclose(frame.rotation, np.eye(3)) and not frame.translation_m.any()
-    return None if same else (cell.chain.platform, frame)
+    return None if same else (cell.platform, frame)
 
 
 def weigh_report(found: Weighed) -> WeighReport:

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE
 from daq.config.checks import centre_faults, gyration_faults, moment_faults
+from daq.config.urdf_text import urdf_text
 from daq.config.yaml_file import (
     Document,
     DocumentKind,
@@ -189,7 +190,8 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
     document = parse_yaml(read_yaml_bytes(path), str(path))
     model = read_model(document, SimulationModel)
     _check(document, model)
-    urdf = read_yaml_bytes(path.parent / model.urdf).decode("utf-8", errors="replace")
+    urdf_path = path.parent / model.urdf
+    urdf = urdf_text(read_yaml_bytes(urdf_path), str(urdf_path))
     if model.closures and (wrong := [*_closed_chain_faults(model, urdf)]):
         raise ConfigurationInconsistent(**fault_texts(document, wrong), remedy="correct the simulation file")
     if payload is not None and payload not in model.payloads:

@@ -229,6 +229,9 @@ def require_known_payload(system: System) -> None:
         raise PayloadMissing(system.runs)
 
 
+KNOWN_PAYLOAD = "known payload"  #: Name of what is known of the payloads, among the unknowns
+
+
 def require_distinct(system: System, *, gains: bool) -> None:
     """Refuse rows that do not distinguish their unknowns.
 
@@ -243,7 +246,7 @@ def require_distinct(system: System, *, gains: bool) -> None:
     names = tuple(column.name for column in system.unknowns)
     columns = np.concatenate([factor[:, system.axis_count :] for factor in system.joints.factors])
     if system.knows_payload:
-        names += ("known payload",)
+        names += (KNOWN_PAYLOAD,)
     else:
         columns = columns[:, :-1]
     independent = base_parameters(columns, names).independent
@@ -253,6 +256,12 @@ def require_distinct(system: System, *, gains: bool) -> None:
         missing = (
             "move every joint through more of its range" if is_bare_seen else "record the same robot without load too"
         )
+        robot = system.model.robot
+        if is_bare_seen and lost == (KNOWN_PAYLOAD,) and robot.carrier < robot.joint_count - 1:
+            missing = (
+                "what is known of the payload does not show behind so few joints: say more of it, as its centre of "
+                "mass (`centre_m`) beside its mass"
+            )
         raise RankDeficient(f"the data do not distinguish payload and robot: {missing}", lost)
     if gains:
         for motor, factor in enumerate(system.motors.factors):

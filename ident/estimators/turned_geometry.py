@@ -212,7 +212,7 @@ class TurnedGeometry:
         else:
             remedy = (
                 f"reverse the row of {name} in `drive_train.ratio` of the cell file (`lead_mm` of a prismatic axis), "
-                "and leave its nameplate gain; of an import with `side: joint`, the sign of its position in the file"
+                "and leave its nameplate gain; of an import with `side: joint`, name it in `reversed` of `position`"
             )
         return Diagnosis(
             POSITION_REVERSED,

@@ -27,6 +27,10 @@ LINKAGE = (
     "closure of the two links about the joints' axis); a gear or belt of another ratio between joints is not supported"
 )
 """What to do about a joint that follows an axis."""
+XACRO_SPACES = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}", "{http://wiki.ros.org/xacro}")
+"""Namespaces of xacro, as its files name them."""
+XACRO_EXPRESSION = "${"
+UNBOUND_PREFIX = "unbound prefix"  #: Of the parser's message
 LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 
 
@@ -280,7 +284,14 @@ def _root(urdf: str) -> Element:
     try:
         robot = fromstring(urdf)
     except (ParseError, TypeError) as error:
-        if "<" not in str(urdf):
+        if UNBOUND_PREFIX in str(error):
+            raise ModelError(
+                f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not declared; expected "
+                'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: is expanded by '
+                "`xacro robot.urdf.xacro > robot.urdf`"
+            ) from error
+        text = str(urdf)
+        if "<" not in text and "\n" not in text:
             raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")
@@ -288,9 +299,24 @@ def _root(urdf: str) -> Element:
         raise ModelError(f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>")
     if robot.get("version", "1.0") not in ("1.0", "1.1"):
         raise ModelError(f"the URDF is of version {robot.get('version')}; expected 1.0 or 1.1")
+    _require_expanded(robot)
     for element in robot.iter():
         element.tag = element.tag.removeprefix(space) if isinstance(element.tag, str) else ""
     return robot
+
+
+def _require_expanded(robot: Element) -> None:
+    """Refuse xacro: macros and expressions that make a URDF once they are expanded."""
+    for element in robot.iter():
+        tag = str(element.tag)
+        is_macro = tag.startswith(XACRO_SPACES)
+        has_expression = any(XACRO_EXPRESSION in value for value in element.attrib.values())
+        if is_macro or has_expression:
+            name = f"<xacro:{tag.rpartition('}')[2]}>" if is_macro else f"{XACRO_EXPRESSION}...}} in <{tag}>"
+            raise ModelError(
+                f"the file is xacro that is not expanded (it has {name}); expected the output of "
+                "`xacro robot.urdf.xacro > robot.urdf`"
+            )
 
 
 def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
@@ -312,7 +338,11 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
             raise ModelError(f"link {child!r} is the child of two joints; expected a tree")
         children.add(child)
         behind[parent].append(joints[name])
+    if not links:
+        raise ModelError("the URDF has no <link>; expected the links of an arm, and the joints between them")
     roots = [name for name in links if name not in children]
+    if not roots:
+        raise ModelError("every link of the URDF is behind a joint; expected a tree, with one link that is the base")
     if len(roots) != 1:
         raise ModelError(
             f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected one, the base"

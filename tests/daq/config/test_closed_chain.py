@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from daq.config.cell import DEGREE, Cell, DeclaredEffect, robot_of
+from daq.config.cell import DEGREE, Cell, DeclaredEffect, model_of, robot_of
 from daq.config.cell_file import load_cell
+from daq.config.same_cell import differing_sections
 from daq.errors import ConfigurationInconsistent, SchemaMismatch
+from daq.report.weighing_views import carrier_text
 from daq.workflow.fit import declared_effects
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
@@ -200,7 +203,30 @@ def test_degrees_of_a_prismatic_joint_are_refused(tmp_path: Path) -> None:
 def test_a_serial_robot_has_no_key_of_a_closed_chain(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationInconsistent, match=r"6: robot\.motors: found given without `closures`") as refusal:
         _cell(tmp_path, (CLOSURE, ""), ("closures:", "closures: []"))
-    assert "found 4 faults" in str(refusal.value)
+    assert "found 3 faults" in str(refusal.value)
+    assert "robot.platform" not in str(refusal.value)
+
+
+def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path: Path) -> None:
+    """Its drawing is in the frame of that link."""
+    shutil.copytree(CHECKOUT / "configs", tmp_path / "configs")
+    path = tmp_path / "configs/cells/rx90.yaml"
+    text = path.read_text(encoding="utf-8")
+    last = load_cell(path)
+    assert model_of(last).robot.carrier == 5
+    path.write_text(text.replace("robot:\n", "robot:\n  platform: link3\n", 1), encoding="utf-8")
+    cell = load_cell(path)
+    model = model_of(cell)
+    assert model.robot.carrier == 2
+    assert model.flange.start < model_of(last).flange.start
+    assert carrier_text(cell).startswith("the joint J3, in which the link link3 is at (0, 0, 0) mm")
+    assert differing_sections(cell, last) == ("robot.platform",)
+    for name, found in (("base", "'base', which does not move"), ("hand", "'hand'")):
+        path.write_text(text.replace("robot:\n", f"robot:\n  platform: {name}\n", 1), encoding="utf-8")
+        with pytest.raises(
+            ConfigurationInconsistent, match=rf"robot\.platform: found {found}; expected a link that mov"
+        ):
+            load_cell(path)
 
 
 def test_places_of_a_cell_are_those_of_its_robot() -> None:

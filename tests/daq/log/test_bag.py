@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
 from daq.cli import main
-from daq.config.import_description import ImportDescription, TimeColumn, TimeUnit
+from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
 from daq.log.bag_table import STAMP, read_bag
 from daq.log.conversion import load_run
@@ -61,14 +61,14 @@ def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **opti
     return path
 
 
-def describe(topic: str | None = None) -> ImportDescription:
-    """A description; the reader needs its topic alone."""
-    return ImportDescription.model_construct(topic=topic)
+def describe(topic: str | None = None, **changes: Any) -> ImportDescription:
+    """A description, with what the reader needs of it alone."""
+    return ImportDescription.model_construct(topic=topic, **changes)
 
 
-def read(path: Path, columns: tuple[str, ...] = COLUMNS, topic: str | None = None) -> Table:
+def read(path: Path, columns: tuple[str, ...] = COLUMNS, topic: str | None = None, **changes: Any) -> Table:
     """Columns with their stamps."""
-    return read_bag(path, describe(topic), columns, TIME)
+    return read_bag(path, describe(topic, **changes), columns, TIME)
 
 
 def whole() -> list[tuple[str, dict[str, Any]]]:
@@ -135,6 +135,102 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
         read(write_bag(tmp_path / "gap.mcap", [*parts[:32], *parts[33:]]))
 
 
+def _unmeasured(row: int) -> dict[str, Any]:
+    """A message of a broadcaster whose hardware has not answered: it sends NaN."""
+    return message(row, effort=[float("nan")] * 6, position=[float("nan")] * 6)
+
+
+def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
+    parts = [("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row)) for row in range(ROWS)]
+    table = read(write_bag(tmp_path / "run.mcap", parts))
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[3:-1])
+    assert table.stamps is not None
+    assert table.stamps.first_ns == START_NS + 3 * STEP_NS
+    assert table.remarks == ("left out, as values are nan at the ends of the bag: 4 stamps",)
+    assert table.place(0, "position.J1") == f"{tmp_path}/run.mcap, row 4, column position.J1"
+
+
+def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> None:
+    parts = whole()
+    parts[50] = ("/joint_states", message(50, effort=[0.5, float("nan"), 0.5, 0.5, 0.5, 0.5]))
+    bag = write_bag(tmp_path / "run.mcap", parts)
+    with pytest.raises(TableUnfit, match=r"found nan for effort\.J2 at 1700000000\.323456\d+ s; .*by `keep`"):
+        read(bag)
+    table = read(bag, keep=KeptPart(to_row=50))
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[:50])
+
+
+@pytest.mark.parametrize(
+    ("part", "rows"),
+    [
+        (KeptPart(from_row=11, to_row=20), slice(10, 20)),
+        (KeptPart(from_s=0.04, to_s=0.08), slice(10, 21)),
+        (KeptPart(from_s=0.041), slice(11, None)),
+    ],
+)
+def test_a_part_of_a_bag_is_kept(part: KeptPart, rows: slice, tmp_path: Path) -> None:
+    table = read(write_bag(tmp_path / "run.mcap", whole()), keep=part)
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[rows])
+    assert table.stamps is not None
+    assert table.stamps.first_ns == START_NS + rows.start * STEP_NS
+    assert table.first_row == rows.start
+
+
+def _other_publisher(row: int, **changes: Any) -> dict[str, Any]:
+    """A second node with the same joints, halfway between two messages of the first one."""
+    seconds, nanoseconds = divmod(START_NS + row * STEP_NS + STEP_NS // 2, 10**9)
+    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
+    return message(row, header=header, position=[0.0] * 6, effort=[], **changes)
+
+
+def _with_another(frame: str = "base", **changes: Any) -> list[tuple[str, dict[str, Any]]]:
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row)))
+        if row % 10 == 5:
+            other = _other_publisher(row) | changes
+            other["header"] = other["header"] | {"frame_id": frame}
+            parts.append(("/joint_states", other))
+    return parts
+
+
+@pytest.mark.parametrize(
+    ("parts", "other"),
+    [
+        (_with_another(), "2: position of J1, J2, J3, J4, J5, J6, frame 'base', 20 messages"),
+        (
+            _with_another("world", effort=[0.0] * 6),
+            "2: position and effort of J1, J2, J3, J4, J5, J6, frame 'world', 20 messages",
+        ),
+        (
+            _with_another(name=["J1", "J2"], position=[0.0, 0.0]),
+            "2: position of J1, J2, frame 'base', 20 messages",
+        ),
+    ],
+    ids=["without effort", "another frame", "some joints"],
+)
+def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
+    parts: list[tuple[str, dict[str, Any]]], other: str, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / "run.mcap", parts)
+    with pytest.raises(TableUnfit, match="found 2 publishers of the same joints on one topic") as caught:
+        read(bag)
+    first = "1: position and effort of J1, J2, J3, J4, J5, J6, frame 'base', 200 messages"
+    assert caught.value.found.endswith(f"{first}; {other}")
+    assert "`publisher: 1`" in caught.value.remedy
+    table = read(bag, publisher=1)
+    assert_whole(table)
+    assert table.remarks == (f"left out, of another publisher: {other}",)
+    with pytest.raises(TableUnfit, match=r"found publisher 3, and those of the topic are 1: .*; 2: "):
+        read(bag, publisher=3)
+
+
+def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", _with_another())
+    with pytest.raises(TableUnfit, match="found messages with 6 names and 0 values of effort"):
+        read(bag, publisher=2)
+
+
 def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
     """The resampling decides what duplicates mean."""
     bag = write_bag(tmp_path / "run.mcap", [whole()[0], *whole()])
@@ -189,6 +285,31 @@ def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     assert_whole(read(folder))
 
 
+def _in_parts(folder: Path, listed: str) -> Path:
+    """A bag of three files, with the metadata that its recorder writes."""
+    folder.mkdir()
+    for number in range(3):
+        write_bag(folder / f"bag_{number}.mcap", whole()[number * 80 : (number + 1) * 80])
+    metadata = f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  topics: []\n"
+    (folder / "metadata.yaml").write_text(metadata, encoding="utf-8")
+    return folder
+
+
+LISTED = "".join(f"  - bag_{number}.mcap\n" for number in range(3))
+
+
+@pytest.mark.parametrize("listed", [LISTED, LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")])
+def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None:
+    """Without its last part it would end early, and nothing else shows it."""
+    folder = _in_parts(tmp_path / "bag", listed)
+    assert_whole(read(folder))
+    (folder / "bag_2.mcap").rename(folder / "renamed_2.mcap")
+    assert_whole(read(folder))
+    (folder / "renamed_2.mcap").unlink()
+    with pytest.raises(TableUnfit, match=r"found no bag_2\.mcap, which metadata\.yaml names; expected all 3 files"):
+        read(folder)
+
+
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
     others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
     bag = write_bag(tmp_path / "run.mcap", [*others, *whole()])
@@ -206,7 +327,12 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
         (("torque.J1",), {}, "found column 'torque.J1'; expected position.JOINT, velocity.JOINT or effort.JOINT"),
         (("velocity.J1",), {}, "6 names and 0 values of velocity"),
         (("effort.J1",), {"effort": [1.0, float("nan")] + [0.0] * 4}, None),
-        (("effort.J2",), {"effort": [1.0, float("nan")] + [0.0] * 4}, "row 1, column effort.J2: found nan"),
+        (
+            ("effort.J2",),
+            {"effort": [1.0, float("nan")] + [0.0] * 4},
+            "found nan in every message for effort.J2; expected numbers",
+        ),
+        (("effort.J2",), {"effort": [1.0, float("inf")] + [0.0] * 4}, "row 1, column effort.J2: found inf"),
     ],
 )
 def test_what_a_bag_lacks_is_named(

@@ -238,3 +238,71 @@ def test_an_empty_line_is_no_sample_of_a_single_column(tmp_path: Path) -> None:
 def test_a_column_by_name_and_by_number_is_one(tmp_path: Path) -> None:
     with pytest.raises(TableUnfit, match="a second time"):
         _read(tmp_path, _text(*ROWS, header="q,i").encode(), ("q", 1))
+
+
+@pytest.mark.parametrize(
+    ("texts", "first_ns", "time_s"),
+    [
+        (["08:59:00.000", "08:59:00.010", "08:59:00.02"], 32_340_000_000_000, [0.0, 0.01, 0.02]),
+        (["8:59:59,99", "9:00:00,00", "9:00:00,01"], 32_399_990_000_000, [0.0, 0.01, 0.02]),
+        (["2026-03-01 23:59:59.5", "2026-03-02 00:00:00.0", "2026-03-02T00:00:00.5"], 86_399_500_000_000, [0, 0.5, 1]),
+    ],
+)
+def test_times_of_day_are_stamps_since_midnight(
+    tmp_path: Path, texts: list[str], first_ns: int, time_s: list[float]
+) -> None:
+    """A decimal comma in them needs another delimiter."""
+    lines = "\n".join(("t;q;i", *(f"{text};1;2" for text in texts))) + "\n"
+    table = _read(tmp_path, lines.encode(), ("q", "i"), TimeUnit.CLOCK, delimiter=";")
+    assert table.stamps is not None
+    assert table.stamps.first_ns == first_ns
+    assert table.stamps.time_s == pytest.approx(time_s, abs=1e-12)
+    assert table.remarks == ()
+
+
+def test_times_of_day_go_on_over_midnight(tmp_path: Path) -> None:
+    table = _stamped(tmp_path, TimeUnit.CLOCK, ["23:59:59.98", "23:59:59.99", "00:00:00.00", "00:00:00.01"])
+    assert table.stamps is not None
+    assert table.stamps.time_s == pytest.approx([0.0, 0.01, 0.02, 0.03], abs=1e-9)
+    assert "times of day that pass midnight" in table.remarks[0]
+
+
+@pytest.mark.parametrize("text", ["8:59 AM", "24:00:00", "08:59", "2026-02-30 08:00:00", "08:60:00", "5.0"])
+def test_what_is_no_time_of_day_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1: .*expected a time of day of 24 hours"):
+        _stamped(tmp_path, TimeUnit.CLOCK, [text] * 3)
+
+
+@pytest.mark.parametrize("text", ["08:59:00.000", "2026-03-01 08:59:00.000", "2026-03-01T08:59:00.000Z"])
+def test_a_time_of_day_where_a_number_is_expected_names_the_unit(tmp_path: Path, text: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column t.*`unit: clock`.*`unit: iso8601`"):
+        _stamped(tmp_path, TimeUnit.SECOND, [text] * 3)
+
+
+@pytest.mark.parametrize(
+    ("unit", "bits", "step"),
+    [
+        (TimeUnit.MICROSECOND, 32, 10_000),
+        (TimeUnit.MILLISECOND, 32, 4),
+        (TimeUnit.MILLISECOND, 16, 4),
+        (TimeUnit.NANOSECOND, 32, 1_000_000),
+    ],
+)
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_counter_of_time_that_wraps_goes_on(
+    tmp_path: Path, unit: TimeUnit, bits: int, step: int, signed: bool
+) -> None:
+    """The case of a microsecond counter of 32 bits that is written in seconds is the first one, in another unit."""
+    half = 2 ** (bits - 1) if signed else 0
+    counts = [(2**bits - 3 * step + step * row - 1) % 2**bits - half for row in range(8)]
+    assert min(np.diff(counts)) < 0
+    table = _stamped(tmp_path, unit, [str(count) for count in counts])
+    assert table.stamps is not None
+    assert table.stamps.time_s == pytest.approx(step * unit.seconds * np.arange(8.0), abs=1e-9)
+    assert f"a counter of {bits} bits in {unit.value} that wraps" in table.remarks[0]
+
+
+def test_two_recordings_are_no_counter_that_wraps(tmp_path: Path) -> None:
+    stamps = _stamped(tmp_path, TimeUnit.MICROSECOND, ["10", "20", "30", "0", "10"]).stamps
+    assert stamps is not None
+    assert stamps.time_s[3] < 0.0

@@ -30,6 +30,7 @@ from daq.report.document import json_tree
 from daq.report.log import info_report
 from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
+from tests.studies.real_runs import ur10
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 NAMES = [f"q{i}" for i in range(1, 7)] + [f"i{i}" for i in range(1, 7)]
@@ -582,6 +583,25 @@ def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.Capture
     np.testing.assert_allclose(run.position_rad[:, 0], joint_rad[:, 0], atol=1e-8)
 
 
+def test_counts_without_a_sign_are_those_with_one(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """A drive's counter of 32 bits that a tool reads as unsigned jumps by 2³² at zero; one column stays above it."""
+    motor_rad = np.radians(bench.joint_deg) @ load_run_of(bench).T
+    counts = np.rint(motor_rad / (2 * pi) * 65536)
+    counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=counted)
+    bench.write_csv(np.hstack((counts, bench.current_a)))
+    assert bench.run() == 0
+    expected = load_run(bench.out)[0].position_rad
+    bench.out.unlink()
+    unsigned = np.where(counts < 0, counts + 2**32, counts)
+    assert (np.abs(np.diff(unsigned, axis=0)) > 2**31).any()
+    bench.write_csv(np.hstack((unsigned, bench.current_a)))
+    capsys.readouterr()
+    assert bench.run() == 0
+    assert "column q1: counts of 32 bits without a sign, read as counts with one" in capsys.readouterr().out
+    np.testing.assert_array_equal(load_run(bench.out)[0].position_rad, expected)
+
+
 def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
     turn, ratio = TURN_WITH_WRAPS, load_run_of(bench)
     _with_counts_that_wrap(bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))))
@@ -884,3 +904,281 @@ def test_stamps_in_another_unit_have_no_rate_of_a_robot(checkout: Path, tmp_path
     bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "s"})
     with pytest.raises(TableUnfit, match="Hz with `unit: s`"):
         import_recording(bench.description, bench.data, bench.out, software="test")
+
+
+def _two_files(bench: Bench) -> None:
+    """Positions with stamps in one file, currents in another one."""
+    stamps = 0.004 * np.arange(300)
+    with_time = np.column_stack((stamps, bench.joint_deg))
+    for name, names, values in (
+        ("position.csv", ["t", *NAMES[:6]], with_time),
+        ("current.csv", NAMES[6:], bench.current_a),
+    ):
+        lines = [",".join(names), *(",".join(map(repr, row)) for row in values.tolist())]
+        (bench.data / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
+    """0.4 to 0.8 s at 250 Hz; the files that have no stamps give the same rows."""
+    _two_files(bench)
+    bench.describe(
+        position={"file": "position.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"},
+        current={"file": "current.csv", "columns": NAMES[6:], "unit": "A"},
+        rate_hz=None,
+        time={"file": "position.csv", "column": "t", "unit": "s"},
+        keep={"from_s": 0.4, "to_s": 0.8},
+    )
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg[100:201]), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a[100:201], atol=1e-9)
+    assert run.started_s == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("keep", "rows"),
+    [
+        ({"from_row": 21}, slice(20, 300)),
+        ({"to_row": 280}, slice(0, 280)),
+        ({"from_s": 0.02, "to_s": 0.25}, slice(20, 251)),
+    ],
+)
+def test_rows_are_kept_at_a_stated_rate(bench: Bench, keep: dict[str, float], rows: slice) -> None:
+    bench.describe(keep=keep)
+    assert bench.run() == 0
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg[rows]), atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("keep", "said"),
+    [
+        ({"from_row": 5, "to_row": 4}, "a begin before the end"),
+        ({"from_s": 1.0, "to_s": 1.0}, "a begin before the end"),
+        ({"from_row": 5, "to_s": 4.0}, "rows or times, not both"),
+        ({"from_row": 0}, "greater than or equal to 1"),
+    ],
+)
+def test_a_part_that_is_none_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], keep: dict[str, float], said: str
+) -> None:
+    bench.describe(keep=keep)
+    _refused(bench, capsys, 6, said)
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> None:
+    """No sample is in both, and none is lost."""
+    if timed:
+        _with_time(bench, 1_772_348_400_000.0 + 4.0 * np.arange(300))
+    part = {"from_s": 0.8 if timed else 0.2}
+    time = {"file": "run.csv", "column": "t", "unit": "ms"} if timed else None
+    bench.describe(rate_hz=None if timed else 1000, time=time, holdout=part)
+    held_out = bench.out.with_name("held-out.mcap")
+    imported = import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+    assert imported.statistics.samples == 200
+    assert imported.holdout is not None
+    assert imported.holdout.samples == 100
+    runs = [load_run(path)[0] for path in (bench.out, held_out)]
+    joined = np.vstack([run.position_rad for run in runs])
+    np.testing.assert_allclose(joined, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(np.vstack([run.current_a for run in runs]), bench.current_a, atol=1e-9)
+    if timed:
+        assert runs[1].started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
+    assert read_log(bench.out).head.run.run_id != read_log(held_out).head.run.run_id
+
+
+def test_the_command_writes_both_logs_and_reports_them(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(holdout={"from_s": 0.2})
+    held_out = bench.out.with_name("held-out.mcap")
+    command = ["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out)]
+    assert main([*command, "--holdout", str(held_out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["samples"] == 200
+    assert report["holdout"] == {"log": str(held_out), "samples": 100}
+
+
+@pytest.mark.parametrize(
+    ("part", "named", "error", "said"),
+    [
+        ({"from_s": 0.2}, False, UsageError, "give `--holdout FILE`"),
+        (None, True, UsageError, "found no `holdout`"),
+        ({"from_s": 0.3}, True, TableUnfit, "found 0.3 s, of 0.3 s that are imported"),
+        ({"from_s": 0.001}, True, TableUnfit, "found 0.001 s, of 0.3 s"),
+    ],
+)
+def test_a_held_out_part_that_is_none_is_refused(
+    bench: Bench, part: dict[str, float] | None, named: bool, error: type[Exception], said: str
+) -> None:
+    bench.describe(holdout=part)
+    held_out = bench.out.with_name("held-out.mcap") if named else None
+    with pytest.raises(error, match=said):
+        import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+    assert bench.left == []
+
+
+def test_a_log_that_cannot_be_written_leaves_no_held_out_part(bench: Bench) -> None:
+    bench.describe(holdout={"from_s": 0.2})
+    bench.out.write_bytes(b"mine")
+    with pytest.raises(UsageError):
+        import_recording(
+            bench.description, bench.data, bench.out, software="test", holdout=bench.out.with_name("held-out.mcap")
+        )
+    assert bench.left == ["run.mcap"]
+
+
+def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: Path) -> None:
+    """A ROS 2 bag in SQLite; the two logs are the parts that the studies read past the import."""
+    bag = "ur10_exciting_trajectory.db3"
+    description = tmp_path / "ur10.yaml"
+    document = {
+        "name": "ur10",
+        "cell": str(shared_data / "ur10/ur10-cell.yaml"),
+        "position": {"file": bag, "columns": ["position"], "unit": "rad", "side": "joint"},
+        "current": {"file": bag, "columns": ["effort"], "unit": "Nm"},
+        "time": {"file": bag, "column": "header.stamp", "unit": "ns"},
+        "holdout": {"from_s": 16.512},
+    }
+    description.write_text(json.dumps(document), encoding="utf-8")
+    logs = tmp_path / "fit.mcap", tmp_path / "held-out.mcap"
+    import_recording(description, shared_data / "ur10", logs[0], software="test", holdout=logs[1])
+    recording = ur10(shared_data)
+    (whole,) = recording.runs
+    (is_fit,) = recording.part_of
+    for log, part in zip(logs, (1, 0), strict=True):
+        run, _ = load_run(log)
+        assert run.rate_hz == pytest.approx(125.0)
+        np.testing.assert_allclose(run.position_rad, whole.position_rad[is_fit == part], atol=1e-8)
+        np.testing.assert_allclose(run.current_a, whole.current_a[is_fit == part], atol=1e-6)
+
+
+def _file_of_each_axis(bench: Bench, later_s: float = 0.0) -> None:
+    """A trace of each axis, with stamps of its own, as the tool of a drive exports them."""
+    for axis in range(6):
+        stamps = 0.004 * np.arange(300) + (later_s if axis == 2 else 0.0)
+        columns = np.column_stack((stamps, bench.joint_deg[:, axis], bench.current_a[:, axis]))
+        lines = ["t,position,current", *(",".join(map(repr, row)) for row in columns.tolist())]
+        (bench.data / f"axis{axis + 1}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    files = [f"axis{axis + 1}.csv" for axis in range(6)]
+    bench.describe(
+        position={"file": files, "columns": ["position"], "unit": "deg", "side": "joint"},
+        current={"file": files, "columns": ["current"] * 6, "unit": "A"},
+        rate_hz=None,
+        time={"file": "axis1.csv", "column": "t", "unit": "s"},
+    )
+
+
+def test_axes_come_from_a_file_each(bench: Bench) -> None:
+    _file_of_each_axis(bench)
+    assert bench.run() == 0
+    run, _ = load_run(bench.out)
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
+
+
+def test_an_error_names_the_file_of_its_axis(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _file_of_each_axis(bench)
+    path = bench.data / "axis4.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    good = lines[41]
+    lines[41] = ",".join((*good.split(",")[:2], "1e9"))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "axis4.csv:42, column current")
+    lines[41] = ",".join((good.split(",")[0], "5000.0", "0.1"))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "import description 'run', axis J4")
+
+
+def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    """A row that one file lacks would shift its axis; a clock that begins elsewhere is said."""
+    _file_of_each_axis(bench, later_s=0.1)
+    assert bench.run() == 0
+    assert "axis3.csv: its stamps begin 0.1 s after those of axis1.csv" in capsys.readouterr().out
+    bench.out.unlink()
+    path = bench.data / "axis3.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([*lines[:50], *lines[51:], "1.3,0.0,0.0"]) + "\n", encoding="utf-8")
+    _refused(bench, capsys, 4, "axis3.csv:51, column time", "rows of the same instants in both files")
+
+
+@pytest.mark.parametrize(
+    ("files", "columns", "said"),
+    [
+        (["axis1.csv", "axis2.csv"], ["position"], "2 columns"),
+        (["axis1.csv", "axis2.csv"], ["position"] * 3, "as many files as columns"),
+    ],
+)
+def test_files_and_columns_that_do_not_match_are_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], files: list[str], columns: list[str], said: str
+) -> None:
+    _file_of_each_axis(bench)
+    bench.describe(current={"file": files, "columns": columns, "unit": "A"})
+    _refused(bench, capsys, 6, said)
+
+
+@pytest.mark.parametrize("kind", ["mapping", "list"])
+def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) -> None:
+    """As N of a prismatic axis beside Nm of the others."""
+    cell = bench.folder / "configs/cells/demo.yaml"
+    text = cell.read_text(encoding="utf-8")
+    assert text.count("nameplate_gain_nm_per_a:") == 6
+    first, *rest = re.split("nameplate_gain_nm_per_a:(.*)", text)
+    for axis, gain in enumerate(rest[::2]):
+        unit = "Nm/N" if axis == 1 else "Nm/Nm"
+        first += f'nameplate_gain: {gain.strip()}\n    gain_unit: "{unit}"' + rest[2 * axis + 1]
+    cell.write_text(first, encoding="utf-8")
+    units = {f"J{axis + 1}": "N" if axis == 1 else "Nm" for axis in range(6)}
+    stated: object = units if kind == "mapping" else list(units.values())
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": stated})
+    assert bench.run() == 0
+    assert [axis.gain_unit for axis in load_run(bench.out)[1].axes][:3] == ["Nm/Nm", "Nm/N", "Nm/Nm"]
+
+
+@pytest.mark.parametrize("unit", ["Nm", ["Nm"] * 5, {"J1": "Nm"}])
+def test_units_of_other_axes_are_refused(bench: Bench, capsys: pytest.CaptureFixture[str], unit: object) -> None:
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": unit})
+    _refused(bench, capsys, 6, "current.unit")
+
+
+@pytest.mark.parametrize("unit", ["deg", "counts"])
+def test_axes_that_count_the_other_way_are_reversed(bench: Bench, unit: str) -> None:
+    """Their velocities are checked likewise."""
+    values = bench.joint_deg
+    side = "joint"
+    if unit == "counts":
+        values = np.rint(np.radians(bench.joint_deg) @ load_run_of(bench).T / (2 * pi) * 65536)
+        side = "motor"
+    section = {"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": side}
+    bench.write_csv(np.hstack((values, bench.current_a)))
+    bench.describe(position=section)
+    assert bench.run() == 0
+    expected = load_run(bench.out)[0].position_rad
+    bench.out.unlink()
+    values = values.copy()
+    values[:, [1, 3]] *= -1.0
+    bench.write_csv(np.hstack((values, bench.current_a)))
+    bench.describe(position={**section, "reversed": ["J2", "J4"]})
+    assert bench.run() == 0
+    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=1e-9)
+
+
+def test_velocities_have_signs_of_their_own(bench: Bench) -> None:
+    names = [*NAMES, *(f"v{axis + 1}" for axis in range(6))]
+    velocity = np.gradient(bench.joint_deg, 0.001, axis=0)
+    velocity[:, 2] *= -1.0
+    rows = np.hstack((bench.joint_deg, bench.current_a, velocity)).tolist()
+    lines = [",".join(names), *(",".join(map(repr, row)) for row in rows)]
+    (bench.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    section = {"file": "run.csv", "columns": names[12:], "unit": "deg/s", "side": "joint"}
+    bench.describe(velocity=section)
+    assert bench.run() == 4
+    bench.describe(velocity={**section, "reversed": ["J3"]})
+    assert bench.run() == 0
+
+
+@pytest.mark.parametrize("key", ["position", "velocity"])
+def test_a_reversed_axis_that_is_none_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str], key: str) -> None:
+    section = {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint", "reversed": ["J9"]}
+    if key == "velocity":
+        section |= {"unit": "deg/s", "columns": [f"v{axis}" for axis in range(6)]}
+    bench.describe(**{key: section})
+    _refused(bench, capsys, 6, f"{key}.reversed", "J9", "some of J1, J2")

@@ -25,9 +25,9 @@ WANTED = TimeColumn(file="run.csv", column="t", unit=TimeUnit.SECOND)
 def _clock(time_s: AnyFloats, wanted: TimeColumn = WANTED, numbers: FloatArray | None = None) -> Clock:
     """The clock of these stamps; every row has numbers of its own unless they are given."""
     numbers = np.arange(float(len(time_s)))[:, None] if numbers is None else numbers
-    return clock_of(
-        Table(Path("run.csv"), (), numbers, "", Stamps(np.asarray(time_s, dtype=np.float64), 0), 2), wanted, numbers
-    )
+    stamps = Stamps(np.asarray(time_s, dtype=np.float64), 0)
+    lines = range(2, 2 + len(time_s))
+    return clock_of(Table(Path("run.csv"), (), numbers, "", stamps, lines), wanted, numbers)
 
 
 def _steps(rng: np.random.Generator, count: int, steps_ms: tuple[int, ...] = (10, 12)) -> FloatArray:

@@ -271,10 +271,42 @@ def test_no_geometry_that_cannot_be(wrong: tuple[str, str], message: str) -> Non
         (('<robot name="r">', '<robot name="r" version="2.0">'), "version 2.0; expected 1.0"),
         (("</robot>", ""), "cannot be read.*expected XML"),
         (("robot", "myrobot"), "cannot be read"),
+        (('<link name="a"/>', '<xacro:arm name="a"/>'), "unbound prefix.*expected xmlns:PREFIX"),
+        (("<link", "<body"), "connects link 'a', which the URDF does not have"),
     ],
 )
 def test_what_is_no_urdf_of_an_arm_is_refused(wrong: tuple[str, str], message: str) -> None:
     urdf = TWO_LINKS.replace(*wrong, 1)
+    with pytest.raises(ModelError, match=message):
+        read_urdf(urdf)
+
+
+@pytest.mark.parametrize("space", ["http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro"])
+def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
+    """An expanded file may still declare the namespace."""
+    declared = TWO_LINKS.replace('name="r"', f'name="r" xmlns:xacro="{space}"', 1)
+    assert [joint.name for joint in read_urdf(declared).joints] == ["j"]
+    macro = declared.replace("</robot>", '<xacro:arm prefix=""/></robot>')
+    with pytest.raises(ModelError, match=r"xacro that is not expanded \(it has <xacro:arm>\); .*`xacro robot"):
+        read_urdf(macro)
+    expression = declared.replace('name="j"', 'name="${prefix}j"', 1)
+    with pytest.raises(ModelError, match=r"xacro that is not expanded \(it has \$\{\.\.\.\} in <joint>\)"):
+        read_urdf(expression)
+
+
+@pytest.mark.parametrize(
+    ("urdf", "message"),
+    [
+        ('<robot name="r"/>', "has no <link>; expected the links of an arm"),
+        (
+            TWO_LINKS.replace(
+                "</robot>", '<joint name="back" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+            ),
+            "every link of the URDF is behind a joint; expected a tree",
+        ),
+    ],
+)
+def test_a_urdf_without_a_base_is_named(urdf: str, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         read_urdf(urdf)
 

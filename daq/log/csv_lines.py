@@ -1,0 +1,504 @@
+"""A CSV file as lines: its header, its line of units, its rows of numbers, and what is none of these.
+
+Lines that are empty, or begin with the sign of a comment, are left out before and after the rows. Among the rows they
+may part two recordings, so there they are refused, unless the import description says what they are.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.import_description import Column, CsvLayout, ImportDescription, PositionUnit, Section, TimeColumn
+from daq.errors import TableUnfit, counted
+from daq.files import read_regular
+from daq.log.table import unreadable
+
+LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
+LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
+COMMENT_SIGNS = ("#", "%", "//")  #: Of lines before and after the rows
+SHOWN = 40  #: Characters of a line in a message
+MINUS = "\u2212"  #: The minus sign of typography, which spreadsheets write
+POSITION_UNITS = {"rad": "rad", "deg": "deg", "°": "deg", "m": "m", "mm": "mm"}
+TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "\u00b5s": "us", "\u03bcs": "us", "ns": "ns"}
+VELOCITY_UNITS = {"rad/s": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "m/s": "m/s", "mm/s": "mm/s"}
+OF_CURRENTS = ("a", "ma", "arms", "nm", "mnm", "n", "n.m", "n·m", "n*m", "v", "%", "‰")
+OF_OTHERS = ("counts", "count", "inc", "incr", "ticks", "c", "°c", "degc", "k", "rpm", "1/min", "rad/s^2", "w", "hz")
+OTHER_UNITS = frozenset((*OF_CURRENTS, *OF_OTHERS))
+"""In lower case; those of positions, times and velocities are compared with the import description."""
+MISSING = frozenset(("", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "na", "n/a", "null", "none"))
+"""Words for a number that is not there, in lower case: a line with them is a row."""
+TURNING_OR_NOT = {"rad": {"rad", "m"}, "deg": {"deg", "mm"}, "m": {"m"}, "mm": {"mm"}}
+"""Units in the file by that of the description: `deg` is mm for the prismatic axes of a robot that has both."""
+
+
+@dataclass(frozen=True, slots=True)
+class CsvLines:
+    """A CSV file as lines."""
+
+    path: Path  #: path of the file
+    table: CsvLayout  #: its layout
+    names: tuple[str, ...]  #: column names from the header; empty without one
+    rows: tuple[str, ...]  #: lines of numbers
+    numbers: Sequence[int]  #: of the line of each row, from 1
+    first_row: int  #: rows that were cut off before the first one
+
+    def fields(self, row: str) -> list[str]:
+        """Split a line into fields without quotes and white space; a delimiter between quotes belongs to its field.
+
+        Raises:
+            csv.Error: a quote is not closed.
+        """
+        return split_fields(row, self.table.delimiter)
+
+    def place(self, row: int, index: int) -> str:
+        """Name a field in a message: `run.csv:42, column i3`."""
+        return f"{self.line(row)}, column {self.names[index] if self.names else index + 1}"
+
+    def line(self, row: int) -> str:
+        """Name the line of a row in a message: `run.csv:42`."""
+        return f"{self.path}:{self.numbers[row]}"
+
+    def number(self, text: str) -> float:
+        """Read a field; NaN if it is no number."""
+        return read_number(text, self.table.decimal)
+
+    def index(self, column: Column) -> int:
+        """Return the place of a column.
+
+        Raises:
+            TableUnfit: it is not there, or twice.
+        """
+        width = len(self.fields(self.rows[0]))
+        if isinstance(column, int):
+            if column <= width:
+                return column - 1
+            raise TableUnfit(
+                str(self.path), found=f"{width} columns", expected=f"a column {column}", remedy="columns count from 1"
+            )
+        if self.names.count(column) == 1:
+            return self.names.index(column)
+        raise TableUnfit(
+            str(self.path),
+            found=f"columns {', '.join(self.names)}",
+            expected=f"one column {column!r}",
+            remedy="correct `columns` in the import description",
+        )
+
+    def part(self, rows: slice) -> CsvLines:
+        """Return some of the rows."""
+        first, _, _ = rows.indices(len(self.rows))
+        kept = self.rows[rows]
+        return CsvLines(self.path, self.table, self.names, kept, self.numbers[rows], self.first_row + first)
+
+
+def split_fields(row: str, delimiter: str) -> list[str]:
+    """Split a line into fields; see `CsvLines.fields`."""
+    if '"' not in row:
+        return row.split() if delimiter == " " else [part.strip() for part in row.split(delimiter)]
+    text = " ".join(row.split()) if delimiter == " " else row.strip(" ")
+    reader = csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True)
+    return [part.strip() for part in next(reader)]
+
+
+def read_number(text: str, decimal: str) -> float:
+    """Read a field; NaN if it is no number."""
+    if "_" in text:  # Python reads 1_000, no other program does
+        return math.nan
+    try:
+        return float(text.replace(",", ".") if decimal == "," else text)
+    except ValueError:
+        return math.nan
+
+
+def read_lines(
+    path: Path, wanted: ImportDescription, columns: Sequence[Column], time: TimeColumn | None
+) -> tuple[CsvLines, tuple[str, ...]]:
+    """Read a file as lines, all of the same number of fields, and remark on what is odd about it.
+
+    Args:
+        path: of the file.
+        wanted: its layout, and the rows that are kept.
+        columns: that are read, without that of the time.
+        time: the time column, if it is in this file.
+
+    Raises:
+        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row, or has another number of fields;
+            its line of units contradicts the import description.
+    """
+    try:
+        data = read_regular(path, LARGEST_BYTES)
+    except OSError as error:
+        raise unreadable(path, error, "a CSV file") from error
+    text, *remarks = _decoded(path, data)
+    has_last_end = text.endswith(("\n", "\r"))
+    file = _Parts(path, wanted.table, text.splitlines())
+    named = [column for column in (*columns, *([] if time is None else [time.column])) if isinstance(column, str)]
+    start, names = file.head(named)
+    units_line = file.units_line(start, names, columns)
+    if units_line is not None:
+        _check_units(file, units_line, names, wanted, time)
+        start = units_line + 1
+        remarks.append(f"line {start} was taken for the units of the columns: {file.shown(units_line)}")
+    end = file.end(start)
+    beyond = [number for number in range(end, len(file.lines)) if file.lines[number].strip()]
+    if beyond:
+        remarks.append(f"left out after the rows: {counted(len(beyond), 'line')}, {file.shown(beyond[0])}")
+    numbers, skipped = file.row_numbers(start, end, has_time=wanted.time is not None)
+    remarks += skipped
+    rows = slice(None) if wanted.keep is None else wanted.keep.rows
+    first, _, _ = rows.indices(len(numbers))
+    kept = numbers[rows]
+    if not kept:
+        raise _without_rows(file, start, len(numbers), wanted)
+    file.check_quotes(kept)
+    rows_kept = tuple(file.lines[number].replace(MINUS, "-") for number in kept)
+    if any(MINUS in file.lines[number] for number in kept):
+        remarks.append("the minus sign U+2212 was read as -")
+    lines = CsvLines(path, wanted.table, names, rows_kept, [number + 1 for number in kept], first)
+    _check_header(lines, start)
+    _check_shape(lines, len(names))
+    is_last = not beyond and kept[-1] == end - 1
+    if is_last and not has_last_end and len(kept) > 1:
+        _check_last(lines)
+        remarks.append("the last line has no end of line; its numbers are complete and were taken")
+    return lines, tuple(f"{path.name}: {remark}" for remark in remarks)
+
+
+def _without_rows(file: _Parts, start: int, rows: int, wanted: ImportDescription) -> TableUnfit:
+    """Make the error for a file without rows, or without those that are kept."""
+    lines = len(file.lines)
+    found = f"{lines} lines, of which {min(start, lines)} before the numbers"
+    remedy = "was the export interrupted?"
+    if rows and wanted.keep is not None:
+        found = f"{counted(rows, 'row')} of numbers, none of them in `keep`"
+        remedy = "correct `keep` in the import description"
+    return TableUnfit(str(file.path), found=found, expected="a line of numbers for each sample", remedy=remedy)
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """All lines of a file, and which of them are what."""
+
+    path: Path
+    table: CsvLayout
+    lines: list[str]
+
+    def fields(self, number: int) -> list[str]:
+        """Split a line; one field where a quote is not closed."""
+        try:
+            return split_fields(self.lines[number], self.table.delimiter)
+        except csv.Error:
+            return [self.lines[number]]
+
+    def shown(self, number: int) -> str:
+        """Return a line for a message."""
+        return repr(self.lines[number][:SHOWN])
+
+    def is_comment(self, number: int) -> bool:
+        """Whether a line begins with the sign of a comment."""
+        signs = COMMENT_SIGNS if self.table.comment is None else (*COMMENT_SIGNS, self.table.comment)
+        return self.lines[number].lstrip().startswith(signs)
+
+    def is_row(self, number: int) -> bool:
+        """Whether a line has a number."""
+        return any(math.isfinite(read_number(field, self.table.decimal)) for field in self.fields(number))
+
+    def head(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
+        """Return the first line behind the header, and its names.
+
+        A header may begin with the sign of a comment: it is the line that has the names that are looked for, or the
+        last one before the rows.
+        """
+        start = self._behind_delimiter_line(self.table.skip_rows)
+        wanted = set(named)
+        first = start
+        while first < len(self.lines):
+            is_skipped = not self.lines[first].strip() or self.is_comment(first)
+            if not is_skipped or (self.table.header and self._is_header(first, wanted)):
+                break
+            first += 1
+        if not self.table.header:
+            return first, ()
+        if first >= len(self.lines):
+            return first, ()
+        names = self.fields(first)
+        if not wanted <= set(names):
+            bare = self._without_sign(first)
+            names = bare if wanted <= set(bare) else names
+        return first + 1, tuple(names)
+
+    def _is_header(self, number: int, wanted: set[str]) -> bool:
+        if not self.lines[number].strip():
+            return False
+        has_names = bool(wanted) and (wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number)))
+        follows = number + 1 < len(self.lines) and self.is_row(number + 1) and not self.is_comment(number + 1)
+        return has_names or follows
+
+    def _without_sign(self, number: int) -> list[str]:
+        text = self.lines[number].lstrip()
+        for sign in COMMENT_SIGNS:
+            text = text.removeprefix(sign)
+        return split_fields(text.strip(), self.table.delimiter) if '"' not in text else []
+
+    def _behind_delimiter_line(self, number: int) -> int:
+        """Return the line behind `sep=;`, by which a spreadsheet names the delimiter."""
+        if number >= len(self.lines):
+            return number
+        text = self.lines[number].strip().strip('"')
+        if not text.lower().startswith("sep=") or len(text) > len("sep=x"):
+            return number
+        stated = self.lines[number].strip(' "\r\n')[len("sep=") :]
+        if stated and stated != self.table.delimiter:
+            raise TableUnfit(
+                f"{self.path}:{number + 1}",
+                found=f"`sep={stated}`, which names the delimiter of the file",
+                expected=f"{self.table.delimiter!r}, the `delimiter` under `table` of the import description",
+                remedy=f"write `delimiter: {stated!r}` there",
+            )
+        return number + 1
+
+    def units_line(self, start: int, names: tuple[str, ...], columns: Sequence[Column]) -> int | None:
+        """Return the line of units below the header, None without one.
+
+        Its fields are no numbers, and at least one of those that are read is a unit.
+        """
+        number = start
+        while number < len(self.lines) and (not self.lines[number].strip() or self.is_comment(number)):
+            number += 1
+        if not names or number >= len(self.lines):
+            return None
+        fields = self.fields(number)
+        if len(fields) != len(names) or self.is_row(number):
+            return None
+        read = [fields[index] for index in _indices(columns, names)]
+        if any(field.lower() in MISSING for field in read):
+            return None
+        return number if any(_is_unit(field) for field in read) else None
+
+    def end(self, start: int) -> int:
+        """Return the line behind the last row: empty lines and comments after it are no rows."""
+        end = len(self.lines)
+        while end > start and (not self.lines[end - 1].strip() or self.is_comment(end - 1)):
+            end -= 1
+        return end
+
+    def row_numbers(self, start: int, end: int, *, has_time: bool) -> tuple[list[int], list[str]]:
+        """Return the numbers of the lines that are rows or ought to be, from 0, and remarks on those that are not.
+
+        Args:
+            start, end: first line behind the head, and behind the last row.
+            has_time: stamps show where a recording goes on, so that an empty line says nothing.
+        """
+        while start < end and (not self.lines[start].strip() or self.is_comment(start)):
+            start += 1
+        sign = self.table.comment
+        comments = [number for number in range(start, end) if sign and self.lines[number].lstrip().startswith(sign)]
+        empty = [number for number in range(start, end) if not self.lines[number].strip()]
+        remarks = []
+        left_out = set(comments)
+        if comments:
+            remarks.append(f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows")
+        is_doubled = len(empty) > 1 and all(later - number == 2 for number, later in pairwise(empty))
+        if empty and (has_time or (is_doubled and 2 * len(empty) + 1 >= end - start)):
+            left_out |= set(empty)
+            remarks.append(f"left out: {counted(len(empty), 'empty line')} among the rows")
+        return [number for number in range(start, end) if number not in left_out], remarks
+
+    def check_quotes(self, numbers: Sequence[int]) -> None:
+        """Refuse a quote that is not closed: where the fields of such a line end is a guess."""
+        for number in numbers:
+            if '"' not in self.lines[number]:
+                continue
+            try:
+                split_fields(self.lines[number], self.table.delimiter)
+            except csv.Error as error:
+                raise TableUnfit(
+                    f"{self.path}:{number + 1}",
+                    found=f"a quote that does not enclose a whole field, in {self.shown(number)}",
+                    expected="quotes around whole fields, closed on the same line",
+                    remedy="export the table without quotes, or without that column",
+                ) from error
+
+
+def _indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
+    """Return the places of the columns that are there."""
+    found = []
+    for column in columns:
+        if isinstance(column, int):
+            if column <= len(names):
+                found.append(column - 1)
+        elif column in names:
+            found.append(names.index(column))
+    return found
+
+
+def _bare_unit(field: str) -> str:
+    """Return a unit without brackets and space."""
+    return field.strip(" []()<>{}").replace(" ", "")
+
+
+def _is_unit(field: str) -> bool:
+    unit = _bare_unit(field)
+    known = unit in POSITION_UNITS or unit in TIME_UNITS or unit in VELOCITY_UNITS
+    return known or unit.lower() in OTHER_UNITS
+
+
+def _check_units(
+    file: _Parts, number: int, names: tuple[str, ...], wanted: ImportDescription, time: TimeColumn | None
+) -> None:
+    """Refuse a line of units that contradicts the import description.
+
+    Raises:
+        TableUnfit: a position, velocity, time or current is in another unit.
+    """
+    fields = file.fields(number)
+
+    def check(key: str, column: Column, known: dict[str, str], stated: str, allowed: set[str]) -> None:
+        for index in _indices((column,), names):
+            unit = _bare_unit(fields[index])
+            if unit in known and known[unit] not in allowed:
+                raise TableUnfit(
+                    f"{file.path}:{number + 1}, column {column}",
+                    found=f"unit {unit!r} in the line of units",
+                    expected=f"{stated!r}, the unit of `{key}` in the import description",
+                    remedy="correct that unit (of a current, its `factor`), or the line in the file",
+                )
+
+    def is_here(name: str) -> bool:
+        return Path(name).parts == file.path.parts[-len(Path(name).parts) :]
+
+    def columns_here(section: Section) -> list[tuple[int, Column]]:
+        """Number and column of each axis whose numbers are in this file."""
+        return [(axis, column) for axis, (name, column) in enumerate(section.places) if is_here(name)]
+
+    position = wanted.position
+    unit = position.unit.value
+    if position.unit is not PositionUnit.COUNTS:
+        for _, column in columns_here(position):
+            check("position", column, POSITION_UNITS, unit, TURNING_OR_NOT[unit])
+    velocity = wanted.velocity
+    if velocity is not None:
+        unit = velocity.unit.value
+        allowed = {f"{one}/s" for one in TURNING_OR_NOT[unit.removesuffix("/s")]}
+        for _, column in columns_here(velocity):
+            check("velocity", column, VELOCITY_UNITS, unit, allowed)
+    if time is not None and not time.unit.is_text:
+        check("time", time.column, TIME_UNITS, time.unit.value, {time.unit.value})
+    current = wanted.current
+    units = current.units([str(column) for _, column in current.places])
+    if units is not None and set(map(abs, current.stated_factors)) == {1.0}:
+        for axis, column in columns_here(current):
+            thousandth = f"m{units[axis]}"
+            check("current", column, {thousandth: thousandth}, units[axis], {units[axis]})
+
+
+def _decoded(path: Path, data: bytes) -> tuple[str, ...]:
+    """Return the text, and a remark if it is not UTF-8."""
+    bom = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        decoded = (data.decode("utf-16"), "read as UTF-16") if bom else (data.decode("utf-8-sig"),)
+        place, kind = decoded[0].find("\0"), "NUL"
+    except UnicodeDecodeError as error:
+        decoded, place, kind = (data.decode("cp1252", "replace"), "no UTF-8; read as Windows-1252"), -1, "no UTF-8"
+        if bom or "\0" in decoded[0] or "\ufffd" in decoded[0]:
+            place, kind = error.start, "no UTF-16" if bom else "no UTF-8"
+    if place >= 0:
+        raise TableUnfit(
+            str(path),
+            found=f"byte {place} is {kind}",
+            expected="text in UTF-8, UTF-16 with a byte order mark, or Windows-1252",
+            remedy="is this a CSV file? if so, save it as UTF-8",
+        )
+    return decoded
+
+
+def _check_header(file: CsvLines, start: int) -> None:
+    """Refuse a header of numbers, the first row of a file without one; columns may be called 0, 1, 2 and so on."""
+    names = file.names
+    values = [file.number(name) for name in names]
+    is_counted = len(values) > 1 and values[0] in (0.0, 1.0) and all(b - a == 1.0 for a, b in pairwise(values))
+    if values and np.isfinite(values).all() and not is_counted:
+        raise TableUnfit(
+            f"{file.path}:{start}",
+            found=f"a header of numbers, {', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
+            expected="names of columns",
+            remedy="if the file has no header, write `header: false` under `table` and columns as numbers from 1",
+        )
+
+
+def _check_shape(file: CsvLines, named: int) -> None:
+    """Refuse lines that are no rows, rows of another number of fields, and a last row that was cut off."""
+    counts = np.array([len(file.fields(row)) for row in file.rows])
+    usual = named or Counter(counts.tolist()).most_common(1)[0][0]
+    wrong = np.flatnonzero(counts != usual)
+    for row in wrong.tolist():
+        _require_row(file, row)
+    last = len(file.rows) - 1
+    if wrong.size and (wrong[0] != last or counts[last] > usual or last == 0):
+        first = int(wrong[0])
+        raise TableUnfit(
+            file.line(first),
+            found=f"{counts[first]} columns",
+            expected=f"{usual}, as in {'the header' if named else 'most lines'}",
+            remedy="check the delimiter in the import description, and the export",
+        )
+    if wrong.size or (not file.fields(file.rows[last])[-1] and file.fields(file.rows[0])[-1]):
+        raise TableUnfit(
+            file.line(last),
+            found=f"a last line {file.rows[last][-SHOWN:]!r} of {counts[last]} fields",
+            expected=f"{usual} complete fields",
+            remedy=f"the file ends early; export or copy it again, or leave that line out by {_keep_to(file, last)}",
+        )
+
+
+def _require_row(file: CsvLines, row: int) -> None:
+    """Refuse a line without any number: an empty one, a comment, a remark of the program that wrote it."""
+    text = file.rows[row]
+    is_row = any(math.isfinite(file.number(field)) for field in file.fields(text))
+    is_comment = text.lstrip().startswith(COMMENT_SIGNS)
+    # A last line of one torn field may be the begin of a number.
+    is_torn = row == len(file.rows) - 1 and not any(character.isalpha() for character in text)
+    if (is_row and not is_comment) or is_torn:
+        return
+    word = text.split()[0] if text.split() else ""
+    sign = next((one for one in COMMENT_SIGNS if word.startswith(one)), word[:4])
+    leave_out = f", or write `comment: {sign!r}` under `table` of the import description" if sign else ""
+    empty = "" if sign else "an empty line, "
+    parts = f"`keep: {{to_row: {file.first_row + row}}}`" if row else "`keep`"
+    raise TableUnfit(
+        file.line(row),
+        found=f"{empty}{text[:SHOWN]!r}, a line that is no row of numbers",
+        expected="rows of numbers alone, after the header",
+        remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two recordings, import what is "
+        f"before it by {parts}, and what is behind it by `from_row`",
+    )
+
+
+def _keep_to(file: CsvLines, row: int) -> str:
+    """Return the setting that keeps the rows before one."""
+    return f"`keep: {{to_row: {file.first_row + row}}}`"
+
+
+def _check_last(file: CsvLines) -> None:
+    """Refuse a last number that may lack digits: one with fewer decimals than all others, or one that jumps."""
+    ends = [file.fields(row)[-1] for row in file.rows]
+    values = np.array([file.number(end) for end in ends])
+    decimals = [len(end.partition(file.table.decimal)[2]) for end in ends]
+    steps = np.abs(np.diff(values))
+    jumps = len(steps) > 1 and steps[-1] > LARGEST_JUMP * steps[:-1].max()
+    if np.isfinite(values[:-1]).all() and (decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])):
+        last = len(file.rows) - 1
+        raise TableUnfit(
+            file.line(last),
+            found=f"a last number {ends[-1]!r} without an end of line, after {ends[-2]!r}",
+            expected="a number with all its digits",
+            remedy=f"the file ends early: export or copy it again, or leave that line out by {_keep_to(file, last)}",
+        )

@@ -1,0 +1,94 @@
+"""The text of a URDF: by its byte order mark, by its declaration, and without either."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell_file import load_cell
+from daq.config.urdf_text import urdf_text
+from daq.environment import shipped_configurations
+from daq.errors import ConfigurationInconsistent
+
+ROBOT = '<robot name="Ärm"><link name="Ä"/><link name="Ö"/></robot>'
+
+
+def _declaration(encoding: str) -> str:
+    return f'<?xml version="1.0" encoding="{encoding}"?>\n'
+
+
+@pytest.mark.parametrize("encoding", ["ISO-8859-1", "windows-1252", "UTF-8", "cp437", "utf-8"])
+def test_a_declared_encoding_decides(encoding: str) -> None:
+    text = _declaration(encoding) + ROBOT
+    assert urdf_text(text.encode(encoding), "arm.urdf") == text
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_decides(encoding: str) -> None:
+    text = _declaration("ISO-8859-1") + ROBOT
+    assert urdf_text(text.encode(encoding), "arm.urdf") == text
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
+@pytest.mark.parametrize("declaration", ["", _declaration("UTF-8")])
+def test_names_stay_apart_without_a_declaration_and_with_a_wrong_one_of_utf_8(encoding: str, declaration: str) -> None:
+    text = declaration + ROBOT
+    assert urdf_text(text.encode(encoding), "arm.urdf") == text
+
+
+def test_lines_before_the_declaration_are_left_out() -> None:
+    text = _declaration("UTF-8") + ROBOT
+    assert urdf_text(b"\n  \n" + text.encode(), "arm.urdf") == text
+
+
+@pytest.mark.parametrize(
+    ("encoding", "message"),
+    [("klingon", "found the encoding 'klingon', which is not known"), ("us-ascii", "byte 55 is not in the declared")],
+)
+def test_what_the_declaration_does_not_explain_is_refused(encoding: str, message: str) -> None:
+    data = (_declaration(encoding) + ROBOT).encode("latin-1")
+    with pytest.raises(ConfigurationInconsistent, match=message) as caught:
+        urdf_text(data, "arm.urdf")
+    assert "save it as UTF-8" in caught.value.remedy
+
+
+@pytest.fixture
+def cell_path(tmp_path: Path) -> Path:
+    """A copy of a shipped cell."""
+    shutil.copytree(shipped_configurations(), tmp_path / "configs")
+    return tmp_path / "configs/cells/rx90.yaml"
+
+
+def test_a_cell_is_read_with_links_that_only_the_declaration_tells_apart(cell_path: Path) -> None:
+    urdf = cell_path.parents[1] / "robots/rx90.urdf"
+    text = urdf.read_text(encoding="utf-8")
+    for plain, accented in (("link1", "Ä"), ("link2", "Ö")):
+        assert plain in text
+        text = text.replace(plain, accented)
+    body = text.partition("?>")[2] if text.startswith("<?xml") else text
+    urdf.write_bytes((_declaration("ISO-8859-1") + body).encode("latin-1"))
+    assert "Ö" in load_cell(cell_path).urdf
+
+
+@pytest.mark.parametrize(
+    ("content", "found", "expected"),
+    [
+        (
+            '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>',
+            "xacro that is not",
+            "`xacro robot",
+        ),
+        ('<robot name="r"/>', "the URDF has no <link>", "the links of an arm"),
+        ("<sdf/>", "its outermost element is <sdf>", "<robot>"),
+    ],
+)
+def test_the_advice_is_about_the_urdf(cell_path: Path, content: str, found: str, expected: str) -> None:
+    (cell_path.parents[1] / "robots/rx90.urdf").write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        load_cell(cell_path)
+    assert found in caught.value.found
+    assert expected in caught.value.expected
+    assert "hold" not in caught.value.expected
+    assert "the URDF that it names" in caught.value.remedy

@@ -1,0 +1,291 @@
+"""Lines of a CSV file that are no rows: units, comments, empty lines, a delimiter's name; and rows that are cut off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
+
+from daq.config.import_description import (
+    CsvLayout,
+    CurrentColumns,
+    ImportDescription,
+    KeptPart,
+    PositionColumns,
+    PositionUnit,
+    Side,
+    TimeColumn,
+    TimeUnit,
+    VelocityColumns,
+    VelocityUnit,
+)
+from daq.errors import TableUnfit
+from daq.log.csv_table import read_csv
+from daq.log.table import Table
+
+COUNT = 12
+VALUES = np.column_stack((0.01 * np.arange(COUNT), np.sin(np.arange(COUNT)), np.cos(np.arange(COUNT))))
+ROWS = [",".join(f"{value:.6f}" for value in row) for row in VALUES.tolist()]
+READ = np.round(VALUES, 6)[:, 1:]
+
+
+def _read(
+    folder: Path,
+    lines: list[str],
+    *,
+    time: TimeUnit | None = TimeUnit.SECOND,
+    unit: PositionUnit = PositionUnit.RAD,
+    columns: tuple[str | int, str | int] = ("q", "i"),
+    factor: float = 1.0,
+    velocity: VelocityUnit | None = None,
+    keep: KeptPart | None = None,
+    end: str = "\n",
+    **layout: Any,
+) -> Table:
+    """Read position and current, and the stamps of column `t`."""
+    path = folder / "run.csv"
+    path.write_text("\n".join(lines) + end, encoding="utf-8")
+    stamps = None if time is None else TimeColumn(file="run.csv", column="t", unit=time)
+    moved = None
+    if velocity is not None:
+        moved = VelocityColumns(file="run.csv", columns=columns[:1], unit=velocity, side=Side.JOINT)
+    wanted = ImportDescription(
+        name="run",
+        cell="cell.yaml",
+        table=CsvLayout(**layout),
+        position=PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT),
+        current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor),
+        velocity=moved,
+        time=stamps,
+        rate_hz=None if time is not None else 100.0,
+        keep=keep,
+    )
+    return read_csv(path, wanted, columns, stamps)
+
+
+@pytest.mark.parametrize("units", ["s,rad,A", "[s],[rad],[A]", "(s), (rad), (A)", "sec,rad,", "s,m,A"])
+def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) -> None:
+    if units.endswith(","):
+        units += "Arms"
+    table = _read(tmp_path, ["t,q,i", units, *ROWS])
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.place(0, "q") == f"{tmp_path}/run.csv:3, column q"
+    assert table.remarks == (f"run.csv: line 2 was taken for the units of the columns: {units!r}",)
+
+
+@pytest.mark.parametrize(
+    ("units", "changes", "found", "expected"),
+    [
+        ("s,deg,A", {}, "unit 'deg' in the line", "'rad', the unit of `position`"),
+        ("s,mm,A", {}, "unit 'mm' in the line", "'rad'"),
+        ("s,°,A", {}, "unit '°' in the line", "'rad'"),
+        ("s,rad,A", {"unit": PositionUnit.DEG}, "unit 'rad' in the line", "'deg'"),
+        ("ms,rad,A", {}, "unit 'ms' in the line", "'s', the unit of `time`"),
+        ("s,rad,mA", {}, "unit 'mA' in the line", "'A', the unit of `current`"),
+        ("s,deg/s,A", {"velocity": VelocityUnit.RAD}, "unit 'deg/s' in the line", "'rad/s', the unit of `velocity`"),
+    ],
+)
+def test_units_that_contradict_the_description_are_refused(
+    tmp_path: Path, units: str, changes: dict[str, Any], found: str, expected: str
+) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column ") as caught:
+        _read(tmp_path, ["t,q,i", units, *ROWS], **changes)
+    assert found in caught.value.found
+    assert expected in caught.value.expected
+
+
+def test_a_factor_explains_another_unit_of_the_current(tmp_path: Path) -> None:
+    assert len(_read(tmp_path, ["t,q,i", "s,rad,mA", *ROWS], factor=0.001).values) == COUNT
+    assert len(_read(tmp_path, ["t,q,i", "s,mm,A", *ROWS], unit=PositionUnit.DEG).values) == COUNT
+
+
+@pytest.mark.parametrize("line", ["Time,Position,Current", "nan,nan,nan", "s,n/a,A", "-,-,-"])
+def test_a_line_of_other_words_is_refused_with_the_setting(tmp_path: Path, line: str) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2"):
+        _read(tmp_path, ["t,q,i", line, *ROWS])
+    kept = _read(tmp_path, ["t,q,i", line, *ROWS], keep=KeptPart(from_row=2))
+    np.testing.assert_array_equal(kept.values, READ)
+
+
+def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 2\}`"):
+        _read(tmp_path, ["t,q,i", "Time,Position,Current", *ROWS])
+
+
+@pytest.mark.parametrize("sign", ["#", "%", "//"])
+def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: str) -> None:
+    lines = [f"{sign} trace of a drive", "", "t,q,i", f"{sign} 100 Hz", *ROWS, "", f"{sign} {COUNT} samples", ""]
+    table = _read(tmp_path, lines)
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.remarks == (f"run.csv: left out after the rows: 1 line, '{sign} {COUNT} samples'",)
+
+
+@pytest.mark.parametrize("header", ["# t,q,i", "% t,q,i", "#t,q,i"])
+@pytest.mark.parametrize("comments", [[], ["# a note, about i"]])
+def test_a_header_may_begin_as_a_comment(tmp_path: Path, header: str, comments: list[str]) -> None:
+    np.testing.assert_array_equal(_read(tmp_path, [*comments, header, *ROWS]).values, READ)
+    np.testing.assert_array_equal(_read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values, READ)
+
+
+def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> None:
+    lines = ["t,#q,i", *ROWS]
+    np.testing.assert_array_equal(_read(tmp_path, lines, columns=("#q", "i")).values, READ)
+    lines = ["#q,t,i", *ROWS]
+    table = _read(tmp_path, lines, columns=("#q", "i"))
+    np.testing.assert_array_equal(table.values[:, 0], np.round(VALUES[:, 0], 6))
+
+
+@pytest.mark.parametrize(
+    ("line", "place"),
+    [("# marker: payload on", 5), ("MARK begin", 5), ("// pause", 5), ("MARK end", COUNT), ("end of trace", COUNT)],
+)
+def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, place: int) -> None:
+    lines = ["t,q,i", *ROWS[:place], line, *ROWS[place:]]
+    with pytest.raises(TableUnfit, match=rf"run\.csv:{place + 2}: found .*a line that is no row of numbers") as caught:
+        _read(tmp_path, lines)
+    assert "delimiter" not in caught.value.remedy
+    assert f"`keep: {{to_row: {place}}}`" in caught.value.remedy
+    before = _read(tmp_path, lines, keep=KeptPart(to_row=place))
+    np.testing.assert_array_equal(before.values, READ[:place])
+    word, _, _ = line.partition(" ")
+    sign = word[:4] if word.isalpha() else word
+    table = _read(tmp_path, lines, comment=sign)
+    np.testing.assert_array_equal(table.values, READ)
+    if place < COUNT:
+        assert table.remarks == ("run.csv: left out, as `comment` says: 1 line among the rows",)
+
+
+@pytest.mark.parametrize("sign", ["1", "-", ".", " ", "+1", "\t#"])
+def test_a_comment_that_may_be_a_number_is_refused(sign: str) -> None:
+    """It would leave out rows."""
+    with pytest.raises(ValidationError, match="a comment that begins as no number does"):
+        TypeAdapter(CsvLayout).validate_python({"comment": sign})
+
+
+def test_empty_lines_are_left_out_where_stamps_show_that_nothing_is_missing(tmp_path: Path) -> None:
+    lines = ["t,q,i", *ROWS[:5], "", *ROWS[5:]]
+    table = _read(tmp_path, lines)
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.place(5, "q") == f"{tmp_path}/run.csv:8, column q"
+    with pytest.raises(TableUnfit, match=r"run\.csv:7: found an empty line"):
+        _read(tmp_path, lines, time=None)
+
+
+def test_line_ends_that_were_doubled_make_no_rows(tmp_path: Path) -> None:
+    doubled: list[str] = []
+    for row in ("t,q,i", *ROWS):
+        doubled += [row, ""]
+    np.testing.assert_array_equal(_read(tmp_path, doubled, time=None).values, READ)
+
+
+@pytest.mark.parametrize("line", ["sep=,", '"sep=,"', "SEP=,"])
+def test_the_line_that_names_the_delimiter_is_no_header(tmp_path: Path, line: str) -> None:
+    np.testing.assert_array_equal(_read(tmp_path, [line, "t,q,i", *ROWS]).values, READ)
+
+
+def test_another_delimiter_than_the_files_own_is_refused(tmp_path: Path) -> None:
+    lines = ["sep=;", "t;q;i", *(row.replace(",", ";") for row in ROWS)]
+    with pytest.raises(TableUnfit, match=r"run\.csv:1: found `sep=;`.*write `delimiter: ';'`"):
+        _read(tmp_path, lines)
+    np.testing.assert_array_equal(_read(tmp_path, lines, delimiter=";").values, READ)
+
+
+def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
+    table = _read(tmp_path, ["t,q,i", *(row.replace("-", "\u2212") for row in ROWS)])
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.remarks == ("run.csv: the minus sign U+2212 was read as -",)
+
+
+def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(tmp_path: Path) -> None:
+    lines = ["t,q,i", *ROWS, "0.12,0.3"]
+    with pytest.raises(TableUnfit, match=rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"):
+        _read(tmp_path, lines, end="")
+    np.testing.assert_array_equal(_read(tmp_path, lines, end="", keep=KeptPart(to_row=COUNT)).values, READ)
+
+
+def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(tmp_path: Path) -> None:
+    lines = ["t,q,i", *ROWS, "t,q,i", *ROWS]
+    with pytest.raises(TableUnfit, match=r"run\.csv:14, column t.*the header is there once more") as caught:
+        _read(tmp_path, lines)
+    assert f"{{to_row: {COUNT}}}" in caught.value.remedy
+    assert f"{{from_row: {COUNT + 2}}}" in caught.value.remedy
+    for part in (KeptPart(to_row=COUNT), KeptPart(from_row=COUNT + 2)):
+        np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, READ)
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 2), (10, 11)])
+def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
+    tmp_path: Path, first: int, last: int
+) -> None:
+    rows = [ROWS[row] if not first <= row <= last else f"{0.01 * row:.2f},nan,nan" for row in range(COUNT)]
+    setting = f"from_row: {last + 2}" if first == 0 else f"to_row: {first}"
+    with pytest.raises(TableUnfit, match=rf"`keep: \{{{setting}\}}`"):
+        _read(tmp_path, ["t,q,i", *rows])
+    part = KeptPart(from_row=last + 2) if first == 0 else KeptPart(to_row=first)
+    kept = READ[last + 1 :] if first == 0 else READ[:first]
+    np.testing.assert_array_equal(_read(tmp_path, ["t,q,i", *rows], keep=part).values, kept)
+
+
+@pytest.mark.parametrize(("from_s", "to_s", "rows"), [(0.03, None, slice(3, None)), (None, 0.05, slice(0, 6))])
+def test_times_are_kept(tmp_path: Path, from_s: float | None, to_s: float | None, rows: slice) -> None:
+    table = _read(tmp_path, ["t,q,i", *ROWS], keep=KeptPart(from_s=from_s, to_s=to_s))
+    np.testing.assert_array_equal(table.values, READ[rows])
+    assert table.stamps is not None
+    assert table.stamps.first_ns == round(1e9 * VALUES[rows][0, 0])
+    assert table.stamps.time_s[-1] == pytest.approx(VALUES[rows][-1, 0] - VALUES[rows][0, 0])
+
+
+PIECES = (
+    *ROWS[:4],
+    "t,q,i",
+    "s,rad,A",
+    "# note",
+    "",
+    "sep=,",
+    "\u2212",
+    "nan,1,2",
+    '"',
+    ",,",
+    "a,b,c",
+    "1e999,0,0",
+    "\t",
+)
+PARTS = (None, KeptPart(from_row=2), KeptPart(to_row=3), KeptPart(from_s=0.01), KeptPart(to_s=0.02))
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    lines=st.lists(st.one_of(st.sampled_from(PIECES), st.text("0123456789.,-e #%;", max_size=12)), max_size=12),
+    time=st.sampled_from((None, TimeUnit.SECOND, TimeUnit.CLOCK)),
+    part=st.sampled_from(PARTS),
+    comment=st.sampled_from((None, "#", "a")),
+)
+def test_any_lines_are_read_or_refused(
+    lines: list[str],
+    time: TimeUnit | None,
+    part: KeptPart | None,
+    comment: str | None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Numbers that are read are finite, and each stamp has its row."""
+    folder = tmp_path_factory.getbasetemp()
+    try:
+        table = _read(folder, ["t,q,i", *lines], time=time, keep=part, comment=comment)
+    except TableUnfit:
+        return
+    assert np.isfinite(table.values).all()
+    assert len(table.values) > 0
+    if time is not None:
+        assert table.stamps is not None
+        assert len(table.stamps.time_s) == len(table.values)
+
+
+@pytest.mark.parametrize("part", [KeptPart(from_row=100), KeptPart(from_s=5.0)])
+def test_a_part_with_nothing_in_it_is_refused(tmp_path: Path, part: KeptPart) -> None:
+    with pytest.raises(TableUnfit, match=rf"found {COUNT} rows.*none of them in `keep`.*correct `keep`"):
+        _read(tmp_path, ["t,q,i", *ROWS], keep=part)
