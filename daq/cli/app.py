@@ -195,6 +195,11 @@ BY_JOB = {
                     "drivegain export mjcf CELL calibration.yaml --out robot.xml",
                 ),
                 Verb("log", "daq.cli.logs:export_log_verb", "drivegain export log loaded.mcap --csv --out loaded.csv"),
+                Verb(
+                    "csv",
+                    "daq.cli.logs:export_csv_verb",
+                    "drivegain export csv calibration.yaml held-out.mcap --out residual.csv",
+                ),
                 Verb("bag", "daq.cli.logs:export_bag_verb", "drivegain export bag loaded.mcap --out loaded-bag"),
             ),
         ),

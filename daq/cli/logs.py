@@ -18,7 +18,15 @@ from daq.cli.terminal import (
     status,
     write_new_folder,
 )
-from daq.cli.verb import JsonOption, output_option, print_json, read_calibration
+from daq.cli.verb import (
+    CalibrationArgument,
+    CellOption,
+    JsonOption,
+    corrected_cell,
+    output_option,
+    print_json,
+    read_calibration,
+)
 from daq.environment import software
 from daq.errors import DaqError, LogForeign, OutputFailed, counted
 from daq.report.text import printable
@@ -164,6 +172,35 @@ def export_log_verb(
     else:
         rows = counted(done.rows, "row")
         print_view([f"{rows} of {counted(len(done.columns), 'column')}"], out)
+
+
+def export_csv_verb(
+    calibration: CalibrationArgument,
+    log: Annotated[Path, typer.Argument(help="A log (.mcap) of the same cell.")],
+    out: Annotated[Path, output_option("--out", "Table to write (.csv); must not exist.")],
+    cell: CellOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write what a calibration predicts of a log, what was measured, and the residual, for a spreadsheet.
+
+    A row per equation of the fit: filtered and decimated as it was. Torque of each joint, current reference of each
+    motor, and whether the row counts in the relative errors.
+    """
+    from daq.log.export import TableFormat, require_new_table, write_table
+    from daq.report.validation import residual_table_report
+    from daq.workflow.residual_table import residual_table
+
+    require_new_table(out, TableFormat.CSV)
+    with status("predicting"):
+        found = residual_table(read_calibration(calibration), log, corrected_cell(cell))
+    write_table(out, TableFormat.CSV, [found.columns])
+    report = residual_table_report(found, calibration, log, out)
+    if json:
+        print_json(report)
+    else:
+        rows = counted(report.rows, "row")
+        total = report.relative_error_percent.total
+        print_view([f"{rows} of {counted(len(report.columns), 'column')}; relative error {total:.3g} %"], out)
 
 
 def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
