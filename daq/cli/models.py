@@ -97,6 +97,7 @@ def export_mjcf_verb(
     """
     from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
     from daq.workflow.full_choice import full_choice
+    from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import cell_limits, random_states
     from daq.workflow.validate import on_cell
@@ -114,6 +115,7 @@ def export_mjcf_verb(
     with status("choosing the bodies"):
         choice = full_choice(known, model, limits, declared.urdf)
     followed = choice.model.follow(random_states(choice.model, limits))
+    effects = joint_effects(known, choice.model.robot)
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
@@ -122,7 +124,8 @@ def export_mjcf_verb(
         frames=read_urdf(declared.urdf).links,
         lower=limits[0] - limits[1],
         upper=limits[0] + limits[1],
-        remarks=tuple(head_remarks(known, choice, software())),
+        effects=effects,
+        remarks=tuple(head_remarks(known, choice, effects, software())),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):

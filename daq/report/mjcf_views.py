@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
@@ -12,19 +13,16 @@ from daq.report.document import Report
 from daq.report.fit import Errors
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.full_choice import FullChoice
-from daq.workflow.mjcf_export import Mjcf, MjcfSource
+from daq.workflow.mjcf_effects import JointEffects
+from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
 from ident.calibration import Calibration
-from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.model.bodies import body_of
 from ident.physical.drive_terms import drive_terms
 from ident.physical.full_parameters import RestsOn
 
-IN_GEOMETRY = frozenset({ZeroOffset.name, GravityDirection.name})
-"""Corrections that the joint frames or the gravity of a model hold; a late position is corrected in recordings."""
-
 
 class MjcfJoint(Report):
-    """Body and joint; armature, damping and friction are zero of a joint without a motor."""
+    """Body and joint."""
 
     name: str
     mass_kg: float
@@ -33,6 +31,9 @@ class MjcfJoint(Report):
     armature: float
     damping: float
     friction: float
+    stiffness: float
+    """of a spring, with its rest position; 0 without one"""
+    spring_rest: float
 
 
 class MjcfActuator(Report):
@@ -58,7 +59,9 @@ class ChosenParameter(Report):
     value: float
     unit: str
     basis: str
-    """`data` or `prior`: which of the two decides on the value"""
+    """`data` or `prior`: which of the two has the larger part in its variance"""
+    prior_share: float
+    """the prior's part, 0 to 1"""
 
 
 class NotInMjcf(Report):
@@ -86,6 +89,8 @@ class MjcfReport(Report):
     actuators: list[MjcfActuator]
     parameters: list[ChosenParameter]
     not_in_mjcf: list[NotInMjcf]
+    effects_at_joints: list[str]
+    """effects that are in stiffness, damping and friction of their joint"""
     effects_left_out: list[str]
     corrections_applied: list[str]
     """effects that correct the description: the joint frames or the gravity of the model are the corrected ones"""
@@ -95,12 +100,13 @@ class MjcfReport(Report):
     """loops that no constraint of MuJoCo closes"""
 
 
-def head_remarks(calibration: Calibration, choice: FullChoice, software: str) -> Iterator[str]:
+def head_remarks(calibration: Calibration, choice: FullChoice, effects: JointEffects, software: str) -> Iterator[str]:
     """Lines for the head of the model.
 
     Args:
         calibration: that is exported.
         choice: its full parameters.
+        effects: of it.
         software: name and version.
     """
     yield f"By {software} from the calibration of {calibration.cell}, {calibration.created}. MuJoCo 3.3.1 or later."
@@ -108,9 +114,8 @@ def head_remarks(calibration: Calibration, choice: FullChoice, software: str) ->
     by_prior = _names_by_prior(choice)
     if by_prior:
         yield f"By the prior, not measured: {', '.join(by_prior)}"
-    left_out = _effects_left_out(calibration)
-    if left_out:
-        yield f"Effects NOT in this model: {', '.join(left_out)}"
+    if effects.left_out:
+        yield f"Effects NOT in this model: {', '.join(effects.left_out)}"
     mountings = _mountings(calibration)
     if mountings:
         yield f"Payloads NOT in this model: {', '.join(mountings)}"
@@ -134,7 +139,6 @@ def mjcf_report(
         out: its file.
         same_configuration: whether the cell file is that of the fit.
     """
-    columns = zip(choice.model.columns, choice.standard, choice.basis, strict=True)
     return MjcfReport.of(
         choice,
         mjcf=out,
@@ -144,12 +148,11 @@ def mjcf_report(
         assumed_links=choice.assumed,
         joints=list(_joints(source)),
         actuators=list(_actuators(source, written)),
-        parameters=[
-            ChosenParameter.of(column, value=float(value), basis=basis.value) for column, value, basis in columns
-        ],
+        parameters=list(_parameters(choice)),
         not_in_mjcf=[NotInMjcf.of(left) for left in written.left_over],
-        effects_left_out=_effects_left_out(calibration),
-        corrections_applied=[f"{one.name} on {one.axis}" for one in calibration.effects if one.name in IN_GEOMETRY],
+        effects_at_joints=source.effects.at_joints,
+        effects_left_out=source.effects.left_out,
+        corrections_applied=source.effects.in_geometry,
         mountings_left_out=_mountings(calibration),
         closures_left_out=written.open_closures,
     )
@@ -194,18 +197,31 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
         yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
 
 
+def _parameters(choice: FullChoice) -> Iterator[ChosenParameter]:
+    for number, column in enumerate(choice.model.columns):
+        yield ChosenParameter.of(
+            column,
+            value=float(choice.standard[number]),
+            basis=choice.basis[number].value,
+            prior_share=float(np.clip(choice.shares[number], 0.0, 1.0)),
+        )
+
+
 def _joints(source: MjcfSource) -> Iterator[MjcfJoint]:
     model = source.model
     terms = drive_terms(model, source.standard)
     for index, columns in enumerate(model.link_columns):
         joint = model.robot.joints[index]
-        drive = {"armature": 0.0, "damping": 0.0, "friction": 0.0}
-        if index in model.robot.axis_joints:
-            axis = model.robot.axis_joints.index(index)
-            drive["armature"] = float(terms.inertia.of_axes[axis])
-            drive["damping"] = float(terms.damping.of_axes[axis])
-            drive["friction"] = float(terms.dry_friction.of_axes[axis])
-        yield MjcfJoint.of(body_of(source.standard[columns]), name=joint.name, **drive)
+        drive = joint_drive(source, terms, index)
+        yield MjcfJoint.of(
+            body_of(source.standard[columns]),
+            name=joint.name,
+            armature=drive["armature"],
+            damping=drive["damping"],
+            friction=drive["frictionloss"],
+            stiffness=drive.get("stiffness", 0.0),
+            spring_rest=drive.get("springref", 0.0),
+        )
 
 
 def _actuators(source: MjcfSource, written: Mjcf) -> Iterator[MjcfActuator]:
@@ -224,10 +240,6 @@ def _actuators(source: MjcfSource, written: Mjcf) -> Iterator[MjcfActuator]:
 def _names_by_prior(choice: FullChoice) -> list[str]:
     columns = zip(choice.model.columns, choice.basis, strict=True)
     return [column.name for column, basis in columns if basis is RestsOn.PRIOR]
-
-
-def _effects_left_out(calibration: Calibration) -> list[str]:
-    return [f"{effect.name} on {effect.axis}" for effect in calibration.effects if effect.name not in IN_GEOMETRY]
 
 
 def _mountings(calibration: Calibration) -> list[str]:

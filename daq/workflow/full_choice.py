@@ -18,10 +18,10 @@ from ident.calibration import Calibration
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.model import Model
-from ident.physical.choice_basis import choice_basis
 from ident.physical.full_parameters import LinkPrior, RestsOn
 from ident.physical.full_set import FullSet
 from ident.physical.physical import EXACT
+from ident.physical.prior_shares import prior_shares
 from ident.prediction import fitted_model, standard_parameters
 
 
@@ -38,11 +38,16 @@ class FullChoice:
 
     model: Model  #: with the calibration's corrections of the description
     standard: FloatArray  #: χ_st without payload, shape (c,)
-    basis: tuple[RestsOn, ...]  #: what each of them rests on
+    shares: FloatArray  #: the prior's part in the variance of each, 0 to 1, shape (c,)
     chosen_by: ChosenBy
     #: ‖Δτ‖/‖τ‖ against the torque of the base parameters, on random states [%].
     torque_change_percent: RelativeError
     assumed: tuple[str, ...]  #: joints with a link for which the URDF has no possible inertia, and a ball was taken
+
+    @property
+    def basis(self) -> tuple[RestsOn, ...]:
+        """What each standard parameter rests on."""
+        return tuple(RestsOn.PRIOR if share > 0.5 else RestsOn.DATA for share in self.shares)
 
     @property
     def exact(self) -> bool:
@@ -70,11 +75,11 @@ def full_choice(calibration: Calibration, model: Model, limits: FloatArray, urdf
         robot = physical_robot(calibration, model, limits, urdf)
         chosen_model = robot.parameters.model
         standard = robot.parameters.standard
-        basis = _basis_of_nearest(calibration, robot)
+        shares = _shares_of_nearest(calibration, robot)
         assumed = tuple(chosen_model.robot.joints[number].name for number in robot.prior.assumed)
     else:
         chosen_model = fitted_model(calibration, model)
-        standard, basis = _of_full_set(found, chosen_model)
+        standard, shares = _of_full_set(found, chosen_model)
     columns = chosen_model.regressor(random_states(chosen_model, limits))
     identified = np.einsum("jck,c->jk", columns, standard_parameters(calibration, chosen_model))
     realised = np.einsum("jck,c->jk", columns, standard)
@@ -82,14 +87,15 @@ def full_choice(calibration: Calibration, model: Model, limits: FloatArray, urdf
     return FullChoice(
         model=chosen_model,
         standard=standard,
-        basis=basis,
+        shares=shares,
         chosen_by=ChosenBy.NEAREST_BODIES if found is None else ChosenBy.PRIOR_OF_FIT,
         torque_change_percent=relative_error(identified, realised, every_row),
         assumed=assumed,
     )
 
 
-def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, tuple[RestsOn, ...]]:
+def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:
+    """Values of full parameters, and the prior's share in each, shape (c,) both."""
     by_name = {parameter.name: parameter for parameter in found.parameters}
     names = [column.name for column in model.columns]
     if set(by_name) != set(names):
@@ -99,13 +105,13 @@ def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, tuple[RestsO
             "use the cell of the fit"
         )
     standard = np.array([by_name[name].value for name in names])
-    return standard, tuple(RestsOn(by_name[name].basis) for name in names)
+    return standard, np.array([by_name[name].prior_share for name in names])
 
 
-def _basis_of_nearest(calibration: Calibration, robot: PhysicalRobot) -> tuple[RestsOn, ...]:
+def _shares_of_nearest(calibration: Calibration, robot: PhysicalRobot) -> FloatArray:
     base = robot.parameters.base
     prior = LinkPrior(robot.prior.links, DEFAULT_TOLERANCE)
-    return choice_basis(robot.parameters.model, base.grouping, _covariance_of(calibration, base.names), prior)
+    return prior_shares(robot.parameters.model, base.grouping, _covariance_of(calibration, base.names), prior)
 
 
 def _covariance_of(calibration: Calibration, names: tuple[str, ...]) -> FloatArray:

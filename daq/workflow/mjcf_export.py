@@ -6,6 +6,7 @@
 | Ia, fv, fs of a joint | `armature`, `damping`, `frictionloss` of the joint |
 | Iam, fvm, fsm of a motor that turns with several joints | the same of a `<fixed>` tendon with the motor's direction |
 | drive gain | `gear` of a `<motor>` on the joint or tendon: its `ctrl` is the current reference |
+| springs, friction of joints without a motor | at their joint (`daq.workflow.mjcf_effects`) |
 | closure of a loop | `<connect>` or `<weld>` between two sites |
 
 MuJoCo makes dry friction a soft constraint. `solreffriction` and `solimpfriction` are as stiff as a step allows: a
@@ -23,6 +24,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from daq.workflow.mjcf_effects import JointEffects
 from ident.arrays import FloatArray
 from ident.calibration import Gain
 from ident.model.bodies import body_of
@@ -53,6 +55,7 @@ class MjcfSource:
     frames: Mapping[str, Place]
     lower: FloatArray  #: least position of each axis [rad or m], shape (m,)
     upper: FloatArray  #: largest position, shape (m,)
+    effects: JointEffects  #: of the calibration
     remarks: tuple[str, ...]  #: for the comment at the head, beside what the writer itself leaves out
 
 
@@ -149,22 +152,41 @@ def _add_joint(body: Element, source: MjcfSource, terms: DriveTerms, index: int)
     joint = robot.joints[index]
     kind = "slide" if joint.kind is JointKind.PRISMATIC else "hinge"
     element = SubElement(body, "joint", name=joint.name, type=kind, axis=_numbers(joint.axis))
-    if index not in robot.axis_joints:
-        return
-    axis = robot.axis_joints.index(index)
-    element.set("range", _numbers((source.lower[axis], source.upper[axis])))
-    element.set("armature", _number(terms.inertia.of_axes[axis]))
-    element.set("damping", _number(terms.damping.of_axes[axis]))
-    element.set("frictionloss", _number(terms.dry_friction.of_axes[axis]))
+    drive = joint_drive(source, terms, index)
+    for attribute, value in drive.items():
+        element.set(attribute, _number(value))
+    if index in robot.axis_joints:
+        axis = robot.axis_joints.index(index)
+        element.set("range", _numbers((source.lower[axis], source.upper[axis])))
+
+
+def joint_drive(source: MjcfSource, terms: DriveTerms, index: int) -> dict[str, float]:
+    """Rotor, friction and spring of a joint, by the attributes of MuJoCo; those of a spring only where it has one."""
+    robot = source.model.robot
+    effects = source.effects
+    drive = {
+        "armature": 0.0,
+        "damping": float(effects.damping[index]),
+        "frictionloss": float(effects.dry_friction[index]),
+    }
+    if index in robot.axis_joints:
+        axis = robot.axis_joints.index(index)
+        drive["armature"] += float(terms.inertia.of_axes[axis])
+        drive["damping"] += float(terms.damping.of_axes[axis])
+        drive["frictionloss"] += float(terms.dry_friction.of_axes[axis])
+    if effects.stiffness[index] > 0.0:
+        drive["stiffness"] = float(effects.stiffness[index])
+        drive["springref"] = float(effects.spring_rest[index])
+    return drive
 
 
 def _body_names(source: MjcfSource) -> list[str]:
-    """Name of the URDF's link that each joint moves."""
-    names = [joint.name for joint in source.model.robot.joints]
+    """Name of the URDF's link that each joint moves: of links with its frame, the first from the base."""
+    named: dict[int, str] = {}
     for name, place in source.frames.items():
         if place.joint >= 0 and _is_joint_frame(place):
-            names[place.joint] = name
-    return names
+            named.setdefault(place.joint, name)
+    return [named.get(index, joint.name) for index, joint in enumerate(source.model.robot.joints)]
 
 
 def _is_joint_frame(place: Place) -> bool:

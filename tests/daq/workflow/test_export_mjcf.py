@@ -102,7 +102,9 @@ def is_moving(robot: CalibratedRobot) -> NDArray[np.bool_]:
     """Mask of the states in which every joint and every motor is fast enough, shape (k,)."""
     velocity = robot.states.velocity_rad_s
     motors = velocity @ robot.model.drive_train.direction.T
-    return np.asarray((np.abs(velocity) > SLOWEST).all(axis=1) & (np.abs(motors) > SLOWEST).all(axis=1))
+    joints = robot.model.follow(robot.states).joints.velocity_rad_s
+    moving = [np.abs(speeds) > SLOWEST for speeds in (velocity, motors, joints)]
+    return np.asarray(np.concatenate(moving, axis=1).all(axis=1))
 
 
 def dry_nm(robot: CalibratedRobot) -> FloatArray:
@@ -303,6 +305,67 @@ def test_effects_are_listed_and_exactly_they_are_missing(tmp_path: Path, capsys:
     assert apart(whole[:, moving], robot.predicted_nm(calibration)[:, moving]) <= SAME
 
 
+def test_springs_and_friction_of_passive_joints_are_at_their_joints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm = robot_of("seven-axis")
+    spring = AcceptedEffect("spring", "J2", {}, (Parameter("spring stiffness 2", 30.0, 0.1, "Nm/rad"),), 6.0, 3.0)
+    pushing = replace(spring, coefficients=(replace(spring.coefficients[0], value=-30.0),))
+    chain = robot_of("five-bar")
+    places = [joint.name for joint in chain.model.robot.places]
+    elbow, other = (places.index(name) + 1 for name in ("elbow-1", "elbow-2"))
+    friction = AcceptedEffect(
+        "passive-friction",
+        "elbow-1",
+        {},
+        (
+            Parameter(f"passive-friction dry {elbow}", 0.4, 0.01, "Nm"),
+            Parameter(f"passive-friction viscous {elbow}", 0.2, 0.01, "Nm/(rad/s)"),
+        ),
+        6.0,
+        3.0,
+    )
+    passive_spring = AcceptedEffect(
+        "passive-spring",
+        "elbow-2",
+        {},
+        (
+            Parameter(f"passive-spring stiffness {other}", 5.0, 0.01, "Nm/rad"),
+            Parameter(f"passive-spring preload {other}", -2.0, 0.01, "Nm"),
+        ),
+        6.0,
+        3.0,
+    )
+    pivot = replace(friction, axis="pivot tip")
+    number = places.index("pivot tip") + 1
+    pivot = replace(
+        pivot,
+        coefficients=tuple(
+            replace(one, name=one.name.rpartition(" ")[0] + f" {number}") for one in friction.coefficients
+        ),
+    )
+    for robot, effect, is_held in (
+        (arm, spring, True),
+        (arm, pushing, False),
+        (chain, friction, True),
+        (chain, passive_spring, True),
+        (chain, pivot, False),
+    ):
+        calibration = robot.with_effect(effect)
+        exported = export(robot, tmp_path, capsys, calibration)
+        name = [f"{effect.name} on {effect.axis}"]
+        assert exported.report["effects_at_joints"] == (name if is_held else [])
+        assert exported.report["effects_left_out"] == ([] if is_held else name)
+        expected = robot.predicted_nm(calibration)
+        assert apart(expected, robot.predicted_nm()) > 1e-3
+        if not is_held:
+            expected = robot.predicted_nm()
+        moving = is_moving(robot)
+        assert moving.sum() >= 100
+        found = inverse_nm(exported.text, robot) + exported.missing_nm
+        assert apart(found[:, moving], expected[:, moving]) <= SAME
+
+
 def test_a_corrected_zero_is_in_the_frames_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Where the calibration corrects the description, recorded positions still mean the same."""
     robot = robot_of("kr270")
@@ -346,8 +409,8 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     robot = robot_of("kr270")
     parameters = []
     for column, value in zip(robot.model.columns, robot.standard, strict=True):
-        basis = "prior" if column.name == "m1" else "data"
-        parameters.append(FullParameter(column.name, 1.01 * float(value), 0.1, column.unit, basis, 0.1, None, None))
+        basis, share = ("prior", 0.9) if column.name == "m1" else ("data", 0.1)
+        parameters.append(FullParameter(column.name, 1.01 * float(value), 0.1, column.unit, basis, share, None, None))
     full = FullSet("arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ())
     exported = export(robot, tmp_path, capsys, replace(robot.calibration, full_parameters=full))
     report = exported.report
@@ -356,6 +419,7 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     assert report["torque_change_percent"]["total"] == pytest.approx(1.0, abs=1e-6)
     assert [one["value"] for one in report["parameters"]] == [one.value for one in parameters]
     assert [one["name"] for one in report["parameters"] if one["basis"] == "prior"] == ["m1"]
+    assert [one["prior_share"] for one in report["parameters"]] == [one.prior_share for one in parameters]
     assert "By the prior, not measured: m1\n" in exported.text
     moving = is_moving(robot)
     found = inverse_nm(exported.text, robot) + exported.missing_nm
@@ -377,6 +441,9 @@ def test_numbers_that_rest_on_the_prior_are_marked(tmp_path: Path, capsys: pytes
     for name, expected in prior.items():
         assert basis[name] == "prior"
         assert value[name] == pytest.approx(expected, rel=1e-4)
+    share = {one["name"]: one["prior_share"] for one in exported.report["parameters"]}
+    assert share["Ixx1"] == pytest.approx(1.0)
+    assert share["fs2"] == pytest.approx(0.0, abs=1e-9)
     assert basis["off2"] == "data"
     assert basis["fs2"] == "data"
     listed = re.search(r"By the prior, not measured: (.*)\n", exported.text)
@@ -390,7 +457,9 @@ def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureF
     urdf = (source / "robots/tx40.urdf").read_text()
     tool = (
         '<link name="tool"/><joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 -0.2 1.1"/>'
-        '<parent link="link6"/><child link="tool"/></joint></robot>'
+        '<parent link="link6"/><child link="tool"/></joint>'
+        '<link name="flange"/><joint name="at flange" type="fixed"><parent link="link6"/><child link="flange"/></joint>'
+        "</robot>"
     )
     (tmp_path / "cells").mkdir()
     (tmp_path / "robots").mkdir()
@@ -405,6 +474,7 @@ def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureF
     placed = poses(robot.model.robot, robot.states.position_rad[3:4])
     at_link = placed.rotation[6, 0]
     assert data.body("link6").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
+    assert data.site("flange").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
     assert data.site("tool").xpos == pytest.approx(placed.origin_m[6, 0] + at_link @ (0.1, 0.02, 0.3), abs=1e-12)
 
 

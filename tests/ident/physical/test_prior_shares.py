@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ident.model.base import base_parameters
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
-from ident.physical.choice_basis import choice_basis
-from ident.physical.full_parameters import LinkPrior, RestsOn
+from ident.physical.full_parameters import LinkPrior
 from ident.physical.physical import inertia_prior, random_motion
+from ident.physical.prior_shares import prior_shares
 from tests.ident.arms import SEVEN_AXES
 
 FloatArray = NDArray[np.float64]
@@ -35,10 +36,15 @@ def _prior_covariance() -> FloatArray:
     return covariance
 
 
-def test_a_basis_is_that_of_the_larger_variance() -> None:
+def _link_std() -> FloatArray:
+    return np.asarray(np.linalg.norm(PRIOR.directions(), axis=2).ravel())
+
+
+def test_shares_are_those_of_the_choice_written_out() -> None:
     grouping = _grouping()
     rng = np.random.default_rng(2)
-    factor = 0.01 * rng.standard_normal((len(grouping), len(grouping)))
+    sizes = np.linalg.norm(grouping[:, MODEL.link_columns.ravel()] * _link_std(), axis=1) + 1e-3
+    factor = 0.01 * sizes[:, None] * rng.standard_normal((len(grouping), len(grouping)))
     covariance = factor @ factor.T
     # The choice written out, χ = χ₀ + K (β̂ − G χ₀) with K = S Gᵀ (G S Gᵀ)⁻¹: S has numbers in place of limits.
     prior = _prior_covariance()
@@ -46,25 +52,17 @@ def test_a_basis_is_that_of_the_larger_variance() -> None:
     by_data = np.diag(gain @ covariance @ gain.T)
     rest = np.eye(len(NAMES)) - gain @ grouping
     by_prior = np.diag(rest @ prior @ rest.T)
-    found = choice_basis(MODEL, grouping, covariance, PRIOR)
-    expected = np.where(by_prior > by_data, "prior", "data")
-    is_clear = np.abs(np.log((by_prior + 1e-30) / (by_data + 1e-30))) > 0.1
-    assert is_clear.sum() > 0.9 * len(NAMES)
-    named = np.array([one.value for one in found])
-    differing = np.flatnonzero(is_clear & (named != expected))
-    assert [NAMES[place] for place in differing] == []
-    assert {one.value for one in found} == {"data", "prior"}
+    found = prior_shares(MODEL, grouping, covariance, PRIOR)
+    expected = by_prior / (by_prior + by_data)
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert ((found > 0.1) & (found < 0.9)).sum() > 10
 
 
-def test_a_parameter_of_its_own_is_data_and_a_sum_with_a_link_is_prior() -> None:
+def test_a_parameter_of_its_own_rests_on_data_and_a_sum_with_a_link_on_the_prior() -> None:
     grouping = _grouping()
-    found = dict(zip(NAMES, choice_basis(MODEL, grouping, 1e-12 * np.eye(len(grouping)), PRIOR), strict=True))
+    found = dict(zip(NAMES, prior_shares(MODEL, grouping, 1e-12 * np.eye(len(grouping)), PRIOR), strict=True))
     # Only the sum Izz1 + Ia1 is seen; the prior of the link decides on both.
-    assert found["Ia1"] is RestsOn.PRIOR
-    assert found["Izz1"] is RestsOn.PRIOR
-    assert found["fs1"] is RestsOn.DATA
-    assert found["off7"] is RestsOn.DATA
-    # With data that say nothing, all that has a prior rests on it, and friction still on the data.
-    poor = dict(zip(NAMES, choice_basis(MODEL, grouping, 1e12 * np.eye(len(grouping)), PRIOR), strict=True))
-    assert poor["fs1"] is RestsOn.DATA
-    assert poor["Ixx1"] is RestsOn.PRIOR
+    assert found["Ia1"] > 0.99
+    assert found["Izz1"] > 0.99
+    assert found["fs1"] < 0.01
+    assert found["off7"] < 0.01

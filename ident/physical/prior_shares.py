@@ -10,7 +10,8 @@ and its errors are those of the data and those of the prior,
 
     cov χ = A C Aᵀ + N (Nᵀ S⁻¹ N)⁻¹ Nᵀ.
 
-As in `ident.physical.full_parameters`, a parameter is *data* where the first part is the larger one, else *prior*.
+The share of the second part in the variance of a parameter says what it rests on, as in
+`ident.physical.full_parameters`.
 """
 
 from __future__ import annotations
@@ -21,16 +22,15 @@ from scipy import linalg
 from ident.arrays import FloatArray
 from ident.model.model import Model
 from ident.physical.consistency import driven_scalars
-from ident.physical.full_parameters import LinkPrior, RestsOn
+from ident.physical.full_parameters import LinkPrior
 
 _LOOSE = 1e-10  #: Singular value, relative to the largest, that counts as zero
 
 
-def choice_basis(model: Model, grouping: FloatArray, covariance: FloatArray, prior: LinkPrior) -> tuple[RestsOn, ...]:
-    """Return what each standard parameter of a chosen set rests on.
+def prior_shares(model: Model, grouping: FloatArray, covariance: FloatArray, prior: LinkPrior) -> FloatArray:
+    """Share of the prior in the variance of each standard parameter of a chosen set, 0 to 1, shape (c,).
 
-    A parameter that no torque depends on and that has no prior, as of a rotor that a joint without a motor lacks, is
-    zero by the model, which counts as data.
+    A parameter that is zero by the model, as the rotor of a joint without a motor, has no variance, and a share of 0.
 
     Args:
         model: the declared model.
@@ -52,14 +52,14 @@ def choice_basis(model: Model, grouping: FloatArray, covariance: FloatArray, pri
     from_data = np.linalg.pinv(scaled, rcond=_LOOSE) / rows
     from_data -= by_prior @ precision @ from_data
     data_variance = np.einsum("xb,bc,xc->x", from_data, covariance, from_data)
+    variance = np.diag(by_prior) + data_variance
+    shares = np.zeros(len(model.columns))
+    shares[present] = np.where(variance > 0.0, np.diag(by_prior) / np.where(variance > 0.0, variance, 1.0), 0.0)
     # A direction without a prior that the data do not determine has no finite variance.
     loose = null - null @ (inverse @ inner)
     is_loose = np.linalg.norm(loose, axis=1) > np.sqrt(_LOOSE)
-    rests_on = [RestsOn.DATA] * len(model.columns)
-    for place, column in enumerate(present):
-        if is_loose[place] or by_prior[place, place] > data_variance[place]:
-            rests_on[column] = RestsOn.PRIOR
-    return tuple(rests_on)
+    shares[present[is_loose]] = 1.0
+    return shares
 
 
 def _scales(model: Model, prior: LinkPrior) -> FloatArray:
