@@ -16,7 +16,7 @@ from daq.workflow.full_choice import FullChoice
 from daq.workflow.mjcf_effects import JointEffects
 from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
 from ident.calibration import Calibration
-from ident.model.bodies import body_of
+from ident.model.bodies import LOADED, body_of
 from ident.physical.drive_terms import drive_terms
 from ident.physical.full_parameters import RestsOn
 
@@ -199,6 +199,8 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
 
 def _parameters(choice: FullChoice) -> Iterator[ChosenParameter]:
     for number, column in enumerate(choice.model.columns):
+        if column.name.endswith(LOADED):
+            continue  # what a payload adds to friction is no part of the robot without one
         yield ChosenParameter.of(
             column,
             value=float(choice.standard[number]),

@@ -36,7 +36,7 @@ from ident.physical.drive_terms import DriveTerms, LeftOver, drive_terms
 FORMAT = "drivegain-mjcf"  #: What the comment at the head of a written model says it is
 TIME_STEP_S = 0.001
 CLOSED_SHARE = 1e-6
-"""Distance of two points, as a share of the robot's size, below which they coincide at every position."""
+"""Change of a distance from position to position, as a share of the robot's size, below which it is constant."""
 HINGE_SHARE = 0.1  #: Distance of the two points that hold a hinge of a loop, as a share of the robot's size
 THINNEST_M = 1e-3  #: Shorter links are not drawn
 _LENGTHS = frozenset({"x", "y", "z"})
@@ -224,31 +224,49 @@ def _add_closures(
         holds = set(closure.directions)
         free = [axis for name, axis in _TURNS.items() if name not in holds]
         if holds >= _LENGTHS and not free:
-            _tie(equality, bodies, "weld", closure, np.zeros(3))
+            _tie(equality, bodies, "weld", closure)
         elif holds >= _LENGTHS and len(free) == 1:
-            _tie(equality, bodies, "connect", closure, np.zeros(3))
-            _tie(equality, bodies, "connect", closure, HINGE_SHARE * size_m * np.eye(3)[free[0]])
-        elif len(free) == 3 and _meets(source, closure, closed_positions):
-            _tie(equality, bodies, "connect", closure, np.zeros(3))
+            along = HINGE_SHARE * size_m * np.eye(3)[free[0]]
+            _tie(equality, bodies, "connect", closure)
+            _tie(equality, bodies, "connect", closure, along, along)
         else:
-            yield closure.name
+            gap_m = _lasting_gap(source, closure, closed_positions)
+            if gap_m is None or len(free) < 3:
+                yield closure.name
+            else:
+                _tie(equality, bodies, "connect", closure, gap_m)
 
 
-def _meets(source: MjcfSource, closure: Closure, positions: FloatArray) -> bool:
-    """Whether the origins of a closure's frames coincide, also in directions that it leaves free."""
+def _lasting_gap(source: MjcfSource, closure: Closure, positions: FloatArray) -> FloatArray | None:
+    """Where the second frame of a closure is in its first, if it is there at every position, shape (3,) [m].
+
+    A planar mechanism closes in two directions and stays where it is in the third one.
+    """
     placed = poses(source.model.robot, positions)
     apart = origin(placed, closure.second) - origin(placed, closure.first)
-    return bool(np.abs(apart).max() <= CLOSED_SHARE * source.model.assembly.size_m)
+    frame = placed.rotation[closure.first.joint + 1] @ closure.first.rotation
+    gaps_m = np.einsum("kji,kj->ki", frame, apart)
+    gap_m = gaps_m.mean(axis=0)
+    largest_m = float(np.abs(gaps_m - gap_m).max())
+    return gap_m if largest_m <= CLOSED_SHARE * source.model.assembly.size_m else None
 
 
-def _tie(equality: Element, bodies: Sequence[Element], kind: str, closure: Closure, beside_m: FloatArray) -> None:
-    """Tie the frames of a closure, at a point in them."""
-    suffix = " along" if beside_m.any() else ""
+def _tie(
+    equality: Element,
+    bodies: Sequence[Element],
+    kind: str,
+    closure: Closure,
+    in_first_m: FloatArray | None = None,
+    in_second_m: FloatArray | None = None,
+) -> None:
+    """Tie the frames of a closure, at a point in each of them; at their origins without one."""
+    suffix = "" if in_second_m is None else " along"
     names = []
-    for number, place in enumerate((closure.first, closure.second), start=1):
+    places = ((closure.first, in_first_m), (closure.second, in_second_m))
+    for number, (place, point_m) in enumerate(places, start=1):
         name = f"{closure.name} {number}{suffix}"
-        moved = Place(place.joint, place.rotation, place.translation_m + place.rotation @ beside_m)
-        _add_site(bodies, name, moved)
+        beside_m = np.zeros(3) if point_m is None else place.rotation @ point_m
+        _add_site(bodies, name, Place(place.joint, place.rotation, place.translation_m + beside_m))
         names.append(name)
     SubElement(equality, kind, name=f"{closure.name}{suffix}", site1=names[0], site2=names[1])
 

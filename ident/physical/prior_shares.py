@@ -21,7 +21,6 @@ from scipy import linalg
 
 from ident.arrays import FloatArray
 from ident.model.model import Model
-from ident.physical.consistency import driven_scalars
 from ident.physical.full_parameters import LinkPrior
 
 _LOOSE = 1e-10  #: Singular value, relative to the largest, that counts as zero
@@ -30,7 +29,8 @@ _LOOSE = 1e-10  #: Singular value, relative to the largest, that counts as zero
 def prior_shares(model: Model, grouping: FloatArray, covariance: FloatArray, prior: LinkPrior) -> FloatArray:
     """Share of the prior in the variance of each standard parameter of a chosen set, 0 to 1, shape (c,).
 
-    A parameter that is zero by the model, as the rotor of a joint without a motor, has no variance, and a share of 0.
+    A parameter that has no prior and that no torque depends on, as the rotor of a joint without a motor, has a share of
+    0: it is zero.
 
     Args:
         model: the declared model.
@@ -38,7 +38,7 @@ def prior_shares(model: Model, grouping: FloatArray, covariance: FloatArray, pri
         covariance: C of the base parameters, shape (b, b).
         prior: of each link, in the order of the robot's joints.
     """
-    present = np.union1d(model.link_columns.ravel(), driven_scalars(model))
+    present = np.union1d(model.link_columns.ravel(), np.flatnonzero(grouping.any(axis=0)))
     scale = _scales(model, prior)[present]
     # In units of the prior: a null space of kg beside kg m² would lose the small ones.
     scaled = grouping[:, present] * scale

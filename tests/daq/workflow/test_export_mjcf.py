@@ -283,6 +283,28 @@ def test_a_simulated_closed_chain_stays_closed(name: str, tmp_path: Path, capsys
     assert apart_m > 10.0 * gap_m
 
 
+def test_a_planar_loop_closes_beside_its_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The rods of a five-bar pass each other: their tips are apart along the axis of the pivot."""
+    source = CHECKOUT / "configs"
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    urdf = (source / "robots/five-bar.urdf").read_text()
+    tip = re.search(r'<joint name="tip-2" type="fixed">\s*<origin xyz="(\S+) (\S+) (\S+)"', urdf)
+    assert tip is not None
+    raised = tip[0].replace(f'{tip[2]} {tip[3]}"', f'{tip[2]} {float(tip[3]) + 0.03:g}"')
+    (tmp_path / "robots/five-bar.urdf").write_text(urdf.replace(tip[0], raised))
+    cell = tmp_path / "cells/five-bar.yaml"
+    cell.write_text((source / "cells/five-bar.yaml").read_text())
+    exported = export(calibrated_robot(cell), tmp_path, capsys)
+    assert exported.report["closures_left_out"] == []
+    simulated = loaded(exported.text)
+    data = mujoco.MjData(simulated)
+    mujoco.mj_resetDataKeyframe(simulated, data, 0)
+    mujoco.mj_forward(simulated, data)
+    assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
+    assert data.ne == 3
+
+
 def test_effects_are_listed_and_exactly_they_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = robot_of("seven-axis")
     coefficient = Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1")
@@ -449,6 +471,28 @@ def test_numbers_that_rest_on_the_prior_are_marked(tmp_path: Path, capsys: pytes
     listed = re.search(r"By the prior, not measured: (.*)\n", exported.text)
     assert listed is not None
     assert listed[1].split(", ") == [name for name, one in basis.items() if one == "prior"]
+
+
+def test_what_a_payload_adds_to_friction_is_no_part_of_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = CHECKOUT / "configs"
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots/tx40.urdf").write_bytes((source / "robots/tx40.urdf").read_bytes())
+    cell = tmp_path / "cells/tx40.yaml"
+    cell.write_text((source / "cells/tx40.yaml").read_text() + "friction_by_payload: true\n")
+    robot = calibrated_robot(cell)
+    assert "fs2_loaded" in [column.name for column in robot.model.columns]
+    more = Parameter("fs2_loaded", 0.7, 0.01, "Nm")
+    calibration = replace(robot.calibration, parameters=(*robot.calibration.parameters, more))
+    exported = export(robot, tmp_path, capsys, calibration)
+    assert exported.report["exact"]
+    assert "_loaded" not in json.dumps(exported.report)
+    assert "_loaded" not in exported.text
+    moving = is_moving(robot)
+    found = inverse_nm(exported.text, robot) + exported.missing_nm
+    assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
 
 
 def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
