@@ -186,10 +186,20 @@ BY_JOB = {
             (
                 Verb(
                     "urdf",
-                    "daq.cli.logs:export_urdf_verb",
+                    "daq.cli.models:export_urdf_verb",
                     "drivegain export urdf CELL calibration.yaml --out robot.urdf",
                 ),
+                Verb(
+                    "mjcf",
+                    "daq.cli.models:export_mjcf_verb",
+                    "drivegain export mjcf CELL calibration.yaml --out robot.xml",
+                ),
                 Verb("log", "daq.cli.logs:export_log_verb", "drivegain export log loaded.mcap --csv --out loaded.csv"),
+                Verb(
+                    "csv",
+                    "daq.cli.logs:export_csv_verb",
+                    "drivegain export csv calibration.yaml held-out.mcap --out residual.csv",
+                ),
                 Verb("bag", "daq.cli.logs:export_bag_verb", "drivegain export bag loaded.mcap --out loaded-bag"),
             ),
         ),

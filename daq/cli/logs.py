@@ -4,36 +4,32 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from daq.cli.terminal import (
     WRITTEN,
-    check_output,
     one_of,
     output_console,
     print_view,
     progress_bar,
-    replace_output,
     say,
     status,
     write_new_folder,
 )
-from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
-from daq.environment import require_packages, software
-from daq.errors import ConfigurationInconsistent, DaqError, LogForeign, OutputFailed, UsageError, counted
-from daq.files import replace_file
+from daq.cli.verb import (
+    CalibrationArgument,
+    CellOption,
+    JsonOption,
+    corrected_cell,
+    output_option,
+    print_json,
+    read_calibration,
+)
+from daq.environment import software
+from daq.errors import DaqError, LogForeign, OutputFailed, counted
 from daq.report.text import printable
-from ident.errors import ModelContradicted
-from ident.plausible import format_at_limit
-
-if TYPE_CHECKING:
-    from daq.config.cell import Cell
-    from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
-    from ident.arrays import FloatArray
-    from ident.calibration import Calibration
-    from ident.model.model import Model
 
 NewLogOption = Annotated[Path, output_option("--out", "Log to write (.mcap); must not exist.")]
 
@@ -185,6 +181,35 @@ def export_log_verb(
         print_view([f"{rows} of {counted(len(done.columns), 'column')}"], out)
 
 
+def export_csv_verb(
+    calibration: CalibrationArgument,
+    log: Annotated[Path, typer.Argument(help="A log (.mcap) of the same cell.")],
+    out: Annotated[Path, output_option("--out", "Table to write (.csv); must not exist.")],
+    cell: CellOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write what a calibration predicts of a log, what was measured, and the residual, for a spreadsheet.
+
+    A row per equation of the fit: filtered and decimated as it was. Torque of each joint, current reference of each
+    motor, and whether the row counts in the relative errors.
+    """
+    from daq.log.export import TableFormat, require_new_table, write_table
+    from daq.report.validation import residual_table_report
+    from daq.workflow.residual_table import residual_table
+
+    require_new_table(out, TableFormat.CSV)
+    with status("predicting"):
+        found = residual_table(read_calibration(calibration), log, corrected_cell(cell))
+    write_table(out, TableFormat.CSV, [found.columns])
+    report = residual_table_report(found, calibration, log, out)
+    if json:
+        print_json(report)
+    else:
+        rows = counted(report.rows, "row")
+        total = report.relative_error_percent.total
+        print_view([f"{rows} of {counted(len(report.columns), 'column')}; relative error {total:.3g} %"], out)
+
+
 def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
     """Say on stderr what a log lacks."""
     if partial:
@@ -216,139 +241,3 @@ def export_bag_verb(
         print_json(bag_report(log, out, done, effort=known is not None))
     else:
         print_view([f"{topic}: {counted(count, 'message')}" for topic, count in done.messages.items()], out)
-
-
-def export_urdf_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
-    out: Annotated[Path, output_option("--out", "URDF to write.")],
-    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
-    ] = None,
-    json: JsonOption = False,
-) -> None:
-    """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
-
-    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
-    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported. Serial robots only: closed
-    chains are refused.
-    """
-    from daq.config.cell_file import URDF, bundle
-    from daq.config.yaml_file import read_yaml_bytes
-    from daq.report.urdf_views import urdf_report, urdf_view
-    from daq.workflow.fit import DOUBTFUL_PERCENT
-    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
-    from daq.workflow.validate import on_cell
-
-    if (calibration is None) == (urdf is None):
-        raise UsageError(
-            "export urdf",
-            found="one file and no --urdf" if urdf is None else "a cell file and --urdf",
-            expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
-            remedy="give the cell file, then the calibration; or leave the cell file out",
-        )
-    given = urdf or cell
-    calibration = calibration or cell
-    check_output(out, (calibration, given), FORMAT)
-    known = read_calibration(calibration)
-    left = known.relative_error_percent.total
-    if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
-        raise ModelContradicted(
-            str(calibration),
-            found=f"a relative error of {format_at_limit(left, DOUBTFUL_PERCENT, 3, 'g')} %",
-            expected=f"at most {DOUBTFUL_PERCENT:g} %",
-            remedy="fit again; `drivegain fit` lists what to check",
-        )
-    content = bundle(given)[URDF] if urdf is None else read_yaml_bytes(given)
-    if out.exists() and out.read_bytes() == content:
-        raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
-    parse_markup(content, str(given))  # before any other reader sees it
-    if urdf is None:
-        declared = _declared(known, given)
-        if declared.chain is not None:
-            raise UsageError(
-                f"cell {declared.name!r}",
-                found="a closed chain: some of its joints have no motor",
-                expected="a serial robot, each joint with a motor: for the links of a loop no masses are computed",
-                remedy="no URDF is written; `drivegain validate`, `weigh` and `contact` predict with the calibration "
-                "itself",
-            )
-        known, model = on_cell(known, declared)
-        limits = cell_limits(declared)
-        same = declared.digest == known.configuration_sha256
-        content = declared.urdf.encode()  # held joints are fixed in it
-    else:
-        model, limits, same = *_plain(content.decode("utf-8")), None
-    require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
-    text = content.decode("utf-8")
-    with status("finding the nearest physical robot"):
-        robot = physical_robot(known, model, limits, text)
-    updates = joint_updates(robot)
-    provenance = f"Inertias by {software()} from the calibration of {known.cell}, {known.created}"
-    updated = update_urdf(content, str(given), updates, provenance)
-    _write(updated, robot, out)
-    if json:
-        print_json(urdf_report(known, robot, updates, updated, out, same))
-    else:
-        print_view(urdf_view(known, robot, updates, updated, same), out)
-
-
-def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
-    """Return body and friction of each moving joint; a negative friction, part of its axis' friction, counts as 0."""
-    from daq.workflow.urdf_export import JointUpdate
-    from ident.model.bodies import body_of
-
-    parameters = robot.parameters
-    values = dict(zip((column.name for column in parameters.model.columns), parameters.standard, strict=True))
-    return {
-        joint.name: JointUpdate(
-            body_of(link), max(0.0, float(values[f"fv{number}"])), max(0.0, float(values[f"fs{number}"]))
-        )
-        for number, (joint, link) in enumerate(
-            zip(parameters.model.robot.joints, parameters.links, strict=True), start=1
-        )
-    }
-
-
-def _declared(calibration: Calibration, path: Path) -> Cell:
-    from daq.config.same_cell import mismatch_of_calibration
-
-    cell = read_cell(path)
-    found = mismatch_of_calibration(calibration, cell)
-    if found is not None:
-        raise ConfigurationInconsistent(
-            str(path), found=found.found, expected=found.expected, remedy="give the cell that was calibrated"
-        )
-    return cell
-
-
-def _plain(urdf: str) -> tuple[Model, FloatArray]:
-    """Return a model with a motor for each joint, and limits typical of arms."""
-    import numpy as np
-
-    from ident.model.model import DriveTrain, Model
-    from ident.model.urdf import robot_from_urdf
-
-    robot = robot_from_urdf(urdf)
-    count = robot.joint_count
-    return Model(robot, DriveTrain(np.eye(count))), np.repeat(np.array([[0.0], [np.pi], [3.0], [10.0]]), count, axis=1)
-
-
-def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
-    """Write the URDF whole or not at all, after reading it back as a robot with these links."""
-    import numpy as np
-
-    from ident.physical.physical import urdf_links
-
-    def check(content: bytes) -> None:
-        if not np.allclose(urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12):
-            raise OutputFailed(
-                str(out),
-                found="other inertias on reading back",
-                expected="those that were written",
-                remedy="nothing was written; please report this URDF",
-            )
-
-    with replace_output(out):
-        replace_file(out, updated.content, check=check)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, CellAxis
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
 from daq.log.message import RawArray
@@ -63,6 +63,21 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         ConfigurationMissing: the package for the format is missing; the message names the extra to install.
         LogUnreadable: the log is damaged or contradicts itself; nothing is written.
     """
+    require_new_table(out, kind)
+    # The first pass finds all damage and all moves; the second writes, a block at a time.
+    reader, cell, verdict = judge_log(log)
+    blocks = tables(LogReader(log), cell, tuple(reader.events), tuple(reader.readings))
+    names, rows = write_table(out, kind, blocks)
+    return Exported(names, rows, reader.partial, *verdict)
+
+
+def require_new_table(out: Path, kind: TableFormat) -> None:
+    """Refuse, before any work is done, a table that cannot be written.
+
+    Raises:
+        UsageError: a file of that name exists.
+        ConfigurationMissing: the package for the format is missing; the message names the extra to install.
+    """
     if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
         raise ConfigurationMissing(
             "Parquet",
@@ -74,8 +89,22 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
         )
-    # The first pass finds all damage and all moves; the second writes, a block at a time.
-    reader, cell, verdict = judge_log(log)
+
+
+def write_table(out: Path, kind: TableFormat, blocks: Iterable[Columns]) -> tuple[tuple[str, ...], int]:
+    """Write a table block by block; the file appears when it is whole.
+
+    Args:
+        out: file to write; must not exist (`require_new_table`).
+        kind: format of the file.
+        blocks: with the same columns each.
+
+    Returns:
+        names of the columns, and the number of rows.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
     names: tuple[str, ...] = ()
     rows = 0
     unfinished = out.with_name(out.name + ".part")
@@ -85,7 +114,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.unlink(missing_ok=True)
             stack.callback(unfinished.unlink, missing_ok=True)
             with _WRITERS[kind](unfinished) as write:
-                for columns in tables(LogReader(log), cell, tuple(reader.events), tuple(reader.readings)):
+                for columns in blocks:
                     names = tuple(columns)
                     rows += len(next(iter(columns.values())))
                     write(columns)
@@ -94,7 +123,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
             unfinished.replace(out)
     except OSError as error:
         raise OutputFailed.of(out, error) from error
-    return Exported(names, rows, reader.partial, *verdict)
+    return names, rows
 
 
 def tables(
@@ -156,16 +185,21 @@ def _columns(
     }
     answered = answers(block.missing, len(cell.axes)).astype(np.uint8)
     for index, (axis, name) in enumerate(zip(cell.axes, column_names(cell), strict=True)):
-        current = axis.gain_unit.partition("/")[2].strip() or "A"
         columns |= {
             f"{name}.position_{axis.unit.si_name}": joints[:, index],
-            f"{name}.current_{re.sub(r'[^0-9A-Za-z%]+', '_', current)}": block.current_raw[:, index] * per_unit[index],
+            f"{name}.current_{current_unit(axis)}": block.current_raw[:, index] * per_unit[index],
             f"{name}.motor_counts": counts[:, index],
             f"{name}.current_raw": block.current_raw[:, index],
             f"{name}.statusword": block.statusword[:, index],
             f"{name}.answered": answered[:, index],
         }
     return columns
+
+
+def current_unit(axis: CellAxis) -> str:
+    """Unit of an axis' current reference, as the name of a column has it."""
+    unit = axis.gain_unit.partition("/")[2].strip() or "A"
+    return re.sub(r"[^0-9A-Za-z%]+", "_", unit)
 
 
 def column_names(cell: Cell) -> list[str]:

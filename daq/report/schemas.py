@@ -20,11 +20,12 @@ from daq.report.job_schemas import (
     SignersReport,
 )
 from daq.report.log import BagReport, ImportReport, InfoReport, RecordReport, SalvageReport, TableReport
+from daq.report.mjcf_views import MjcfReport
 from daq.report.plan import PlanReport
 from daq.report.proposal import DriveChange, DriveRollback, FileChange, FileRollback
 from daq.report.residual_document import ResidualReport
 from daq.report.urdf_views import UrdfReport
-from daq.report.validation import ValidateReport
+from daq.report.validation import ResidualTableReport, ValidateReport
 from daq.report.weighing_views import ContactReport, WeighReport
 
 REPORTS: dict[str, Any] = {
@@ -48,7 +49,7 @@ REPORTS: dict[str, Any] = {
     "fleet": FleetReport,
     "salvage": SalvageReport,
     "import": ImportReport,
-    "export": TableReport | BagReport | UrdfReport,
+    "export": TableReport | ResidualTableReport | BagReport | UrdfReport | MjcfReport,
     "weigh": WeighReport,
     "contact": ContactReport,
 }

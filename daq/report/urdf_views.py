@@ -65,6 +65,7 @@ class UrdfReport(Report):
     merged_links: list[str]
     not_in_urdf: list[NotInUrdf]
     effects_left_out: list[str]
+    closures_left_out: list[str]
 
 
 def urdf_view(
@@ -118,6 +119,7 @@ def urdf_view(
             left_out.append(name)
         elif any(one.value != 0.0 for one in effect.coefficients):
             corrected.append(name)
+    left_out += [f"closure {closure.name}" for closure in robot.parameters.model.robot.closures]
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
     if corrected:
         text = (
@@ -161,6 +163,7 @@ def urdf_report(
             if column.name.startswith(("Ia", "off", "fvm", "fsm")) and not column.name.endswith(LOADED)
         ],
         effects_left_out=[f"{effect.name} on {effect.axis}" for effect in calibration.effects],
+        closures_left_out=[closure.name for closure in parameters.model.robot.closures],
     )
 
 

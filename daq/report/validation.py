@@ -18,8 +18,37 @@ from daq.report.plots import plot_torques
 from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
+from daq.workflow.residual_table import ResidualTable
 from daq.workflow.validate import CrossValidation, DataUse, Mass, Validation, WeighedRun, conditioning_of, together
 from ident.calibration import Calibration, PayloadMass
+
+
+class ResidualTableReport(Report):
+    """`export csv`."""
+
+    calibration: str
+    log: str
+    table: str
+    rows: int
+    columns: list[str]
+    relative_error_percent: Errors
+    """of the rows that count, as `validate` has it"""
+    partial: bool
+    same_configuration: bool
+
+
+def residual_table_report(found: ResidualTable, calibration: Path, log: Path, table: Path) -> ResidualTableReport:
+    """Return the table of predicted, measured and residual that was written."""
+    validation = found.validation
+    return ResidualTableReport.of(
+        validation,
+        calibration=calibration,
+        log=log,
+        table=table,
+        rows=len(validation.time_s),
+        columns=list(found.columns),
+        relative_error_percent=validation.error,
+    )
 
 
 class ValidatedLog(Report):

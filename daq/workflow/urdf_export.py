@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -16,8 +17,11 @@ from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.effects.geometry_corrections import corrected_model
+from ident.errors import ModelError
 from ident.model.bodies import Body
+from ident.model.closed_chain import Assembly, assemble, follow
 from ident.model.model import Model
+from ident.model.robot import Motion, Robot
 from ident.physical.physical import (
     InertiaPrior,
     PhysicalParameters,
@@ -34,6 +38,10 @@ SEED = 0
 MOTION = 0.6
 """Share of the limits of speed and acceleration within which the states lie: recorded runs have a root mean square of
 about a third of their limits, and uniform states one of 0.58 of theirs."""
+
+
+CHAIN_SHARES = (1.0, 0.7, 0.5, 0.3, 0.1)
+"""Shares of the ranges of a closed chain's motors within which its loops may close everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +77,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
         NotPhysical: no set was found.
     """
     model = corrected_model(model, corrections_of(calibration))
-    columns = model.regressor(random_motion(limits, SAMPLES, SEED))
+    columns = model.regressor(random_states(model, limits))
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     known = {p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name}
     # A URDF has the robot without a payload.
@@ -87,6 +95,61 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
             deviations = float(abs(after - before) / std) if std > 0.0 else float("inf")
             shifts.append(Shift(name.split(" ", 1)[0], float(before), float(after), deviations))
     return PhysicalRobot(found, prior, tuple(sorted(shifts, key=lambda shift: -shift.deviations)))
+
+
+def random_states(model: Model, limits: FloatArray) -> Motion:
+    """Draw the states on which torques are compared.
+
+    The ranges of the motors of a closed chain may hold positions that its loops do not reach; then the ranges are
+    narrower, about their middle. Of more motors than degrees of freedom, some lead and the others follow.
+
+    Args:
+        model: the declared model.
+        limits: as of `ident.physical.physical.random_motion`, shape (4, n).
+
+    Raises:
+        ModelError: the loops of a closed chain close in no such range.
+    """
+    if not model.robot.closures:
+        return random_motion(limits, SAMPLES, SEED)
+    leading, robot, assembly = _leading_motors(model)
+    failure: ModelError | None = None
+    for share in CHAIN_SHARES:
+        narrow = limits[:, leading]
+        narrow[1] *= share
+        try:
+            followed = follow(robot, assembly, random_motion(narrow, SAMPLES, SEED))
+        except ModelError as error:
+            failure = error
+            continue
+        motors = list(model.robot.axis_joints)
+        joints = followed.joints
+        return Motion(
+            joints.position_rad[:, motors],
+            joints.velocity_rad_s[:, motors],
+            joints.acceleration_rad_s2[:, motors],
+        )
+    assert failure is not None
+    raise failure
+
+
+def _leading_motors(model: Model) -> tuple[list[int], Robot, Assembly]:
+    """As many axes as there are degrees of freedom, the best ones to lead, and the robot without the other motors."""
+    found: list[tuple[list[int], Robot, Assembly]] = []
+    failure: ModelError | None = None
+    for axes in combinations(range(model.robot.axis_count), model.assembly.mobility):
+        motors = tuple(model.robot.axis_joints[axis] for axis in axes)
+        robot = replace(model.robot, motors=motors)
+        try:
+            assembly = assemble(robot)
+        except ModelError as error:
+            failure = error
+            continue
+        found.append((list(axes), robot, assembly))
+    if not found:
+        assert failure is not None
+        raise failure
+    return min(found, key=lambda one: one[2].condition)
 
 
 def cell_limits(cell: Cell) -> FloatArray:

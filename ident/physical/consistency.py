@@ -12,7 +12,7 @@ import numpy as np
 from ident.arrays import FloatArray, IntArray
 from ident.errors import IdentificationError
 from ident.model.bodies import pseudo_inertia
-from ident.model.model import Model
+from ident.model.model import JOINT_COLUMNS, Model
 
 MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 _ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
@@ -105,28 +105,36 @@ def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[i
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     link_columns = model.link_columns
-    scalars = np.setdiff1d(np.arange(len(index)), link_columns)
+    scalars = driven_scalars(model)
     coupled = model.drive_train.coupled
-    own_friction = [axis for axis in range(model.robot.joint_count) if axis not in other_friction]
-    positive = [index[f"fs{axis + 1}"] for axis in own_friction]
+    number_of = [joint + 1 for joint in model.robot.axis_joints]
+    own_friction = [axis for axis in range(model.robot.axis_count) if axis not in other_friction]
+    positive = [index[f"fs{number_of[axis]}"] for axis in own_friction]
     positive += [index[f"Iam{motor + 1}"] for motor in coupled]
     positive += [index[f"{name}{motor + 1}"] for motor in coupled if motor in own_friction for name in ("fvm", "fsm")]
     dissipative = []
-    for joints in _turned_together(model):
-        motors = [motor for motor in coupled if np.any(model.drive_train.direction[motor, list(joints)])]
+    for axes in _turned_together(model):
+        motors = [motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])]
         for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
-            if single == "fv" and other_friction.intersection(joints):
+            if single == "fv" and other_friction.intersection(axes):
                 continue
-            names = [f"{single}{joint + 1}" for joint in joints] + [f"{shared}{motor + 1}" for motor in motors]
-            if len(joints) == 1:
+            names = [f"{single}{number_of[axis]}" for axis in axes] + [f"{shared}{motor + 1}" for motor in motors]
+            if len(axes) == 1:
                 positive.append(index[names[0]])
             else:
-                # Contribution of each joint's, then each motor's parameter to the matrix over these joints, (p, k, k).
-                turned = [model.drive_train.direction[motor, list(joints)] for motor in motors]
-                shares = [np.diag(unit) for unit in np.eye(len(joints))]
+                # Contribution of each axis', then each motor's parameter to the matrix over these axes, (p, k, k).
+                turned = [model.drive_train.direction[motor, list(axes)] for motor in motors]
+                shares = [np.diag(unit) for unit in np.eye(len(axes))]
                 shares += [np.outer(r, r) - np.diag(r**2) for r in turned]
                 dissipative.append((tuple(index[name] for name in names), np.array(shares)))
     return Consistency(link_columns, scalars, scales, tuple(positive), tuple(dissipative))
+
+
+def driven_scalars(model: Model) -> IntArray:
+    """Columns of rotors, friction and offsets, without those of joints that have no motor, shape (s,)."""
+    of_links = model.link_columns.ravel()
+    undriven = [JOINT_COLUMNS * joint + np.arange(10, JOINT_COLUMNS) for joint in model.robot.passive_joints]
+    return np.setdiff1d(np.arange(len(model.columns)), np.concatenate((of_links, *undriven)))
 
 
 def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
@@ -157,8 +165,8 @@ def solve_programme(cp: Any, objective: Any, constraints: list[Any], unknowns: S
 
 
 def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
-    """Group joints that share motors."""
-    groups: list[set[int]] = [{joint} for joint in range(model.robot.joint_count)]
+    """Group axes that share motors."""
+    groups: list[set[int]] = [{axis} for axis in range(model.robot.axis_count)]
     for motor in model.drive_train.coupled:
         turned = set(np.flatnonzero(model.drive_train.direction[motor]).tolist())
         touched = [group for group in groups if group & turned]

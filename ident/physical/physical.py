@@ -22,6 +22,7 @@ from ident.physical.consistency import (
     Consistency,
     NotPhysical,
     consistency_of,
+    driven_scalars,
     relative_to_prior,
     solve_programme,
 )
@@ -69,6 +70,18 @@ class Programme:
         size = sum(cp.trace(link) for link in links)
         solve_programme(cp, cp.Minimize(distance + _TRACE * size), constraints, (*links, scalars))
         return self._standard(np.array([link.value for link in links]), scalars.value)
+
+    def with_base(self, standard: FloatArray, base: FloatArray) -> FloatArray:
+        """Change standard parameters, shape (c,), so that they have given base parameters.
+
+        The change is the least one, each parameter measured by the prior of its link or its scale. All of it in the
+        leading parameters would be more than a light link has, where the torque hardly shows a base parameter.
+        """
+        size = np.array([np.linalg.norm(self._scaled(unit)) for unit in np.eye(len(standard))])
+        unit_change = np.where(size > 0.0, 1.0 / np.where(size > 0.0, size, 1.0), 0.0)
+        missing = base - self.grouping @ standard
+        change, *_ = np.linalg.lstsq(self.grouping * unit_change, missing, rcond=None)
+        return np.asarray(standard + unit_change * change)
 
     def closest_to_prior(
         self, start: FloatArray, directions: FloatArray, base: FloatArray, farthest: float
@@ -307,7 +320,7 @@ def physical_parameters(
     """
     if not np.all(np.isfinite(values)):
         raise NotPhysical("base parameters must be finite", np.array2string(values, precision=3))
-    count = model.robot.joint_count
+    count = model.robot.axis_count
     leading = list(base.independent)
     identified = np.einsum("jck,c->jk", columns[:, leading], values)
     size = np.linalg.norm(identified, axis=1)
@@ -319,14 +332,16 @@ def physical_parameters(
     nearest = programme.nearest(values)
     apart = float(np.linalg.norm(triangle @ (base.grouping @ nearest - values)))
     exact = apart <= EXACT
-    directions = np.eye(len(nearest))
+    free = np.union1d(model.link_columns.ravel(), programme.consistency.scalars)
+    directions = np.eye(len(nearest))[:, free]
     if exact:  # only the changes that keep all base parameters
-        rest = np.setdiff1d(np.arange(len(nearest)), leading)
-        directions = directions[:, rest]
+        rest = np.setdiff1d(free, leading)
+        directions = np.eye(len(nearest))[:, rest]
         directions[leading] = -base.grouping[:, rest]
+        nearest = programme.with_base(nearest, values)
     standard = programme.closest_to_prior(nearest, directions, values, (1.0 + SLACK) * apart)
     if exact:
-        # The leading parameters take the rest of the solver's tolerance.
+        # The leading parameters take what rounding has left.
         standard[leading] += values - base.grouping @ standard
     for column in programme.consistency.positive:
         standard[column] = max(standard[column], 0.0)
@@ -359,7 +374,7 @@ def _programme(
     prior: InertiaPrior,
     other_friction: frozenset[int],
 ) -> Programme:
-    scalars = np.setdiff1d(np.arange(len(model.columns)), model.link_columns)
+    scalars = driven_scalars(model)
     norms = np.linalg.norm(rows[:, scalars], axis=0)
     scales = 1.0 / np.where(norms > 0.0, norms, 1.0)  # value of each that makes the whole torque
     return Programme(

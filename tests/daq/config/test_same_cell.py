@@ -218,6 +218,7 @@ VERBS: dict[str, tuple[list[str], ExitCode]] = {
     "contact": (["contact", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "certificate": (["certificate", "DEMO", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
     "export urdf": (["export", "urdf", "CELL", "DEMO", "--out", "out.urdf"], ExitCode.CONFIGURATION),
+    "export mjcf": (["export", "mjcf", "CELL", "DEMO", "--out", "out.xml"], ExitCode.CONFIGURATION),
     "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
     "monitor": (["monitor", "CELL", "--calibration", "DEMO", "--once"], ExitCode.DATA_UNFIT),
     "apply": (["apply", "CELL", "DEMO", "--configuration-changed"], ExitCode.CALIBRATION_REFUSED),

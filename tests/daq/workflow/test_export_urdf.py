@@ -30,7 +30,7 @@ from ident.model.bodies import Body
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
 from ident.physical.physical import random_motion, urdf_links
-from tests.daq.calibrations import demo_calibration
+from tests.daq.robot_calibrations import robot_of
 from tests.ident.arms import GANTRY
 
 FloatArray = NDArray[np.float64]
@@ -214,22 +214,16 @@ def test_what_is_refused_and_with_which_code(
     assert not out.exists()
 
 
-def test_a_closed_chain_is_refused_without_the_solver_too(
-    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_of_a_closed_chain_the_tree_is_written_and_its_closures_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(daq.environment, "find_spec", lambda _: None)
-    five_bar = replace(
-        demo_calibration(),
-        cell="five-bar",
-        gains=tuple(Gain(f"crank-{number}", 7.0, 0.01, "Nm/A", 7.0) for number in (1, 2)),
-    )
-    save_calibration(five_bar, tmp_path / "calibration.yaml")
-    cell = checkout / "configs/cells/five-bar.yaml"
-    assert _export(cell, tmp_path / "calibration.yaml", "--out", tmp_path / "out.urdf") == 2
-    said = capsys.readouterr().err
-    assert "a closed chain: some of its joints have no motor" in said
-    assert "physical" not in said
-    assert not (tmp_path / "out.urdf").exists()
+    robot = robot_of("five-bar")
+    out = tmp_path / "out.urdf"
+    assert _export(robot.cell_file, robot.saved(tmp_path), "--out", out) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "exactly the identified one" in said
+    assert "closure tip" in said
+    assert len(urdf_links(out.read_text())) == robot.model.robot.joint_count
 
 
 def test_no_input_and_no_foreign_file_is_overwritten(

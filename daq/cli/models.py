@@ -1,0 +1,211 @@
+"""`drivegain export urdf` and `export mjcf`: a calibrated robot as the model of another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from daq.cli.terminal import check_output, print_view, replace_output, status
+from daq.cli.verb import JsonOption, output_option, print_json, read_calibration, read_cell
+from daq.environment import require_packages, software
+from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
+from daq.files import replace_file
+from ident.errors import ModelContradicted
+from ident.plausible import format_at_limit
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+    from ident.arrays import FloatArray
+    from ident.calibration import Calibration
+    from ident.model.model import Model
+
+
+def export_urdf_verb(
+    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
+    out: Annotated[Path, output_option("--out", "URDF to write.")],
+    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
+
+    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
+    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported. A URDF holds no loops: of a
+    closed chain it has the tree, and the closures are named.
+    """
+    from daq.config.cell_file import URDF, bundle
+    from daq.config.yaml_file import read_yaml_bytes
+    from daq.report.urdf_views import urdf_report, urdf_view
+    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
+    from daq.workflow.validate import on_cell
+
+    if (calibration is None) == (urdf is None):
+        raise UsageError(
+            "export urdf",
+            found="one file and no --urdf" if urdf is None else "a cell file and --urdf",
+            expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
+            remedy="give the cell file, then the calibration; or leave the cell file out",
+        )
+    given = urdf or cell
+    calibration = calibration or cell
+    check_output(out, (calibration, given), FORMAT)
+    known = read_calibration(calibration)
+    _require_explained(known, calibration)
+    content = bundle(given)[URDF] if urdf is None else read_yaml_bytes(given)
+    if out.exists() and out.read_bytes() == content:
+        raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
+    parse_markup(content, str(given))  # before any other reader sees it
+    if urdf is None:
+        declared = _declared(known, given)
+        known, model = on_cell(known, declared)
+        limits = cell_limits(declared)
+        same = declared.digest == known.configuration_sha256
+        content = declared.urdf.encode()  # held joints are fixed in it
+    else:
+        model, limits, same = *_plain(content.decode("utf-8")), None
+    require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
+    text = content.decode("utf-8")
+    with status("finding the nearest physical robot"):
+        robot = physical_robot(known, model, limits, text)
+    updates = joint_updates(robot)
+    provenance = f"Inertias by {software()} from the calibration of {known.cell}, {known.created}"
+    updated = update_urdf(content, str(given), updates, provenance)
+    _write(updated, robot, out)
+    if json:
+        print_json(urdf_report(known, robot, updates, updated, out, same))
+    else:
+        print_view(urdf_view(known, robot, updates, updated, same), out)
+
+
+def export_mjcf_verb(
+    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits.")],
+    calibration: Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")],
+    out: Annotated[Path, output_option("--out", "MJCF model to write (.xml).")],
+    json: JsonOption = False,
+) -> None:
+    """Write the calibrated robot as an MJCF model for MuJoCo 3.3.1 or later.
+
+    Masses, inertias, rotors, friction, and a motor for each axis: its gear is the drive gain, its input the current
+    reference. Bodies are the full parameters of `fit --prior`; without them, the nearest physical bodies to the cell's
+    URDF (pip install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
+    """
+    from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
+    from daq.workflow.full_choice import full_choice
+    from daq.workflow.mjcf_effects import joint_effects
+    from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
+    from daq.workflow.urdf_export import cell_limits, random_states
+    from daq.workflow.validate import on_cell
+    from ident.model.urdf import read_urdf
+
+    check_output(out, (calibration, cell), FORMAT)
+    known = read_calibration(calibration)
+    _require_explained(known, calibration)
+    declared = _declared(known, cell)
+    same = declared.digest == known.configuration_sha256
+    known, model = on_cell(known, declared)
+    limits = cell_limits(declared)
+    if known.full_parameters is None:
+        require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
+    with status("choosing the bodies"):
+        choice = full_choice(known, model, limits, declared.urdf)
+    followed = choice.model.follow(random_states(choice.model, limits))
+    effects = joint_effects(known, choice.model.robot)
+    source = MjcfSource(
+        name=known.cell,
+        model=choice.model,
+        standard=choice.standard,
+        gains=known.gains,
+        frames=read_urdf(declared.urdf).links,
+        lower=limits[0] - limits[1],
+        upper=limits[0] + limits[1],
+        effects=effects,
+        remarks=tuple(head_remarks(known, choice, effects, software())),
+    )
+    written = write_mjcf(source, followed.joints.position_rad)
+    with replace_output(out):
+        replace_file(out, written.content)
+    report = mjcf_report(known, choice, source, written, out, same)
+    if json:
+        print_json(report)
+    else:
+        print_view(mjcf_view(report), out)
+
+
+def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
+    """Return body and friction of each moving joint; a negative friction, part of its axis' friction, counts as 0."""
+    from daq.workflow.urdf_export import JointUpdate
+    from ident.model.bodies import body_of
+
+    parameters = robot.parameters
+    values = dict(zip((column.name for column in parameters.model.columns), parameters.standard, strict=True))
+    return {
+        joint.name: JointUpdate(
+            body_of(link), max(0.0, float(values[f"fv{number}"])), max(0.0, float(values[f"fs{number}"]))
+        )
+        for number, (joint, link) in enumerate(
+            zip(parameters.model.robot.joints, parameters.links, strict=True), start=1
+        )
+    }
+
+
+def _require_explained(calibration: Calibration, path: Path) -> None:
+    """Refuse a calibration that explains too little of the torque to derive bodies from it."""
+    from daq.workflow.fit import DOUBTFUL_PERCENT
+
+    left = calibration.relative_error_percent.total
+    if not left <= DOUBTFUL_PERCENT:
+        raise ModelContradicted(
+            str(path),
+            found=f"a relative error of {format_at_limit(left, DOUBTFUL_PERCENT, 3, 'g')} %",
+            expected=f"at most {DOUBTFUL_PERCENT:g} %",
+            remedy="fit again; `drivegain fit` lists what to check",
+        )
+
+
+def _declared(calibration: Calibration, path: Path) -> Cell:
+    from daq.config.same_cell import mismatch_of_calibration
+
+    cell = read_cell(path)
+    found = mismatch_of_calibration(calibration, cell)
+    if found is not None:
+        raise ConfigurationInconsistent(
+            str(path), found=found.found, expected=found.expected, remedy="give the cell that was calibrated"
+        )
+    return cell
+
+
+def _plain(urdf: str) -> tuple[Model, FloatArray]:
+    """Return a model with a motor for each joint, and limits typical of arms."""
+    import numpy as np
+
+    from ident.model.model import DriveTrain, Model
+    from ident.model.urdf import robot_from_urdf
+
+    robot = robot_from_urdf(urdf)
+    count = robot.joint_count
+    return Model(robot, DriveTrain(np.eye(count))), np.repeat(np.array([[0.0], [np.pi], [3.0], [10.0]]), count, axis=1)
+
+
+def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
+    """Write the URDF whole or not at all, after reading it back as a robot with these links."""
+    import numpy as np
+
+    from ident.physical.physical import urdf_links
+
+    def check(content: bytes) -> None:
+        if not np.allclose(urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12):
+            raise OutputFailed(
+                str(out),
+                found="other inertias on reading back",
+                expected="those that were written",
+                remedy="nothing was written; please report this URDF",
+            )
+
+    with replace_output(out):
+        replace_file(out, updated.content, check=check)

@@ -1,0 +1,93 @@
+"""Effects of a calibration that a joint of MuJoCo has: springs, and friction of joints without a motor.
+
+| effect | at its joint |
+|---|---|
+| `spring`, τ = c q | `stiffness` c, `springref` 0 |
+| `passive-spring`, τ = c q + a | `stiffness` c, `springref` −a/c |
+| `passive-friction`, τ = a sign(q̇) + b q̇ | `frictionloss` a, `damping` b |
+
+A spring that pushes away, c < 0, and effects in a pivot that a loop is cut at are left out. Beyond the largest
+torque of the fit `predict_torque` limits an effect, and a simulator does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.calibration import Calibration
+from ident.effects.effect import Effect
+from ident.effects.friction import PassiveFriction
+from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
+from ident.effects.position import PassiveSpring, Spring
+from ident.model.robot import Robot
+from ident.prediction import placed_effect
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointEffects:
+    """Springs and friction of n joints by effects, and where each effect of a calibration is."""
+
+    stiffness: FloatArray  #: [Nm/rad; N/m], shape (n,)
+    spring_rest: FloatArray  #: position at which the spring rests [rad; m], shape (n,)
+    damping: FloatArray  #: [Nm/(rad/s); N/(m/s)], shape (n,)
+    dry_friction: FloatArray  #: [Nm; N], shape (n,)
+    at_joints: tuple[str, ...]  #: effects that are in these numbers
+    in_geometry: tuple[str, ...]  #: effects that correct joint frames or gravity
+    left_out: tuple[str, ...]  #: all others
+
+
+def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
+    """Find what of the effects of a calibration joints can have.
+
+    Args:
+        calibration: with its effects.
+        robot: whose joints these are.
+
+    Raises:
+        EffectRefused: the calibration holds an effect that does not exist.
+    """
+    numbers = np.zeros((4, robot.joint_count))
+    at_joints: list[str] = []
+    in_geometry: list[str] = []
+    left_out: list[str] = []
+    for accepted in calibration.effects:
+        placed, coefficients = placed_effect(accepted, calibration)
+        name = f"{accepted.name} on {accepted.axis}"
+        if isinstance(placed.effect, ZeroOffset | GravityDirection):
+            in_geometry.append(name)
+            continue
+        joint = _joint_of(placed.axis, robot)
+        own = None if joint is None else _numbers_of(placed.effect, coefficients)
+        if own is None or (own[0] > 0.0 and numbers[0, joint] > 0.0):
+            left_out.append(name)
+        else:
+            numbers[:, joint] += own
+            at_joints.append(name)
+    stiffness, spring_rest, damping, dry_friction = numbers
+    return JointEffects(
+        stiffness, spring_rest, damping, dry_friction, tuple(at_joints), tuple(in_geometry), tuple(left_out)
+    )
+
+
+def _joint_of(place: int, robot: Robot) -> int | None:
+    """Joint of a place of effects (`Robot.places`); None of a pivot that a loop is cut at."""
+    joints = (*robot.axis_joints, *robot.passive_joints)
+    return joints[place] if place < len(joints) else None
+
+
+def _numbers_of(effect: Effect, coefficients: FloatArray) -> FloatArray | None:
+    """Stiffness, rest, damping and dry friction of an effect; None of one that joints do not have."""
+    match effect:
+        case Spring() if coefficients[0] > 0.0:
+            return np.array([coefficients[0], 0.0, 0.0, 0.0])
+        case PassiveSpring() if coefficients[0] > 0.0:
+            stiffness, preload = coefficients
+            return np.array([stiffness, -preload / stiffness, 0.0, 0.0])
+        case PassiveFriction() if coefficients.min() >= 0.0:
+            dry, viscous = coefficients
+            return np.array([0.0, 0.0, viscous, dry])
+        case _:
+            return None
