@@ -29,6 +29,8 @@ from typing import TYPE_CHECKING
 from lazy_names import lazy_names
 
 if TYPE_CHECKING:
+    from ident.arrays import FloatArray as FloatArray
+    from ident.calibration import AcceptedEffect as AcceptedEffect
     from ident.calibration import Calibration as Calibration
     from ident.calibration import calibration_of as calibration_of
     from ident.contact import ExternalTorque as ExternalTorque
@@ -41,11 +43,21 @@ if TYPE_CHECKING:
     from ident.data.run import Run as Run
     from ident.discovery.evidence import Evidence as Evidence
     from ident.discovery.evidence import gather as gather
+    from ident.discovery.gates import Gates as Gates
     from ident.discovery.loop import Step as Step
     from ident.discovery.loop import find_effects as find_effects
+    from ident.discovery.search import Finding as Finding
+    from ident.effects.effect import Effect as Effect
+    from ident.effects.effect import GearSide as GearSide
+    from ident.effects.effect import PlacedEffect as PlacedEffect
+    from ident.effects.effect import Property as Property
+    from ident.effects.effect import Range as Range
+    from ident.effects.signals import Abscissa as Abscissa
+    from ident.effects.signals import Signals as Signals
     from ident.errors import CurrentUnsigned as CurrentUnsigned
     from ident.errors import DataUnfit as DataUnfit
     from ident.errors import Diagnosis as Diagnosis
+    from ident.errors import EffectNotInstalled as EffectNotInstalled
     from ident.errors import EffectRefused as EffectRefused
     from ident.errors import IdentificationError as IdentificationError
     from ident.errors import ModelContradicted as ModelContradicted
@@ -66,6 +78,7 @@ if TYPE_CHECKING:
     from ident.estimators.quick import QuickGains as QuickGains
     from ident.estimators.turned_geometry import find_turned_geometry as find_turned_geometry
     from ident.model.bodies import Payload as Payload
+    from ident.model.model import Column as Column
     from ident.model.model import DriveTrain as DriveTrain
     from ident.model.model import Model as Model
     from ident.model.robot import Motion as Motion

@@ -24,7 +24,8 @@ def example() -> SimpleNamespace:
 
 def test_every_name_is_there() -> None:
     for name in ident.__all__:
-        assert getattr(ident, name).__name__ == name
+        if name != "FloatArray":  # an alias, which has no name of its own
+            assert getattr(ident, name).__name__ == name
     assert set(ident.__all__) <= set(dir(ident))
     misspelt = "identfy"
     with pytest.raises(AttributeError, match=r"no attribute 'identfy'; it exports .*identify"):
