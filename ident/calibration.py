@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array
+from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
@@ -246,6 +248,15 @@ class Calibration:
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
 
     @property
+    def conditioning(self) -> Conditioning:
+        """Filters of the fit.
+
+        Raises:
+            ModelError: `filter` does not have them all.
+        """
+        return Conditioning.of_document(self.filter)
+
+    @property
     def friction_by_payload(self) -> bool:
         """Whether friction with a payload has parameters of its own."""
         return any(parameter.is_payload_friction for parameter in self.parameters)
@@ -279,7 +290,7 @@ class Calibration:
 def calibration_of(
     found: Identification,
     axes: Sequence[str],
-    nameplate: Sequence[float] | FloatArray,
+    nameplate: ArrayLike,
     *,
     units: Sequence[str] = (),
     robot: str = "robot",
@@ -310,17 +321,18 @@ def calibration_of(
         effect = f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
         raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
+    nameplate_gains = np.atleast_1d(as_array("nameplate", nameplate))
     units = units or ("Nm/A",) * len(axes)
-    if not len(axes) == len(nameplate) == len(units) == len(estimate.gains):
+    if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
-            f"{len(axes)} axis names, {len(nameplate)} nameplate gains and {len(units)} units for "
+            f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} units for "
             f"{len(estimate.gains)} identified gains; expected one of each for each axis"
         )
     parameters = tuple(
         Parameter(column.name, float(value + column.about), float(std), column.unit)
         for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     )
-    identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
+    identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate_gains, strict=True)
     gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
     responses = mass_responses(found.system, estimate)
     undriven = found.model.robot.undriven_names

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
@@ -116,14 +117,14 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
 
 
 def measured_torque(
-    calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion | None = None
+    calibration: Calibration, model: Model, current_a: ArrayLike, motion: Motion | None = None
 ) -> FloatArray:
     """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), shape (n_samples, n_axes) each.
 
     Args:
         calibration: with the gains.
         model: the declared model of the same robot.
-        current_a: of the motors.
+        current_a: of the motors; lists and data frames will do.
         motion: of the axes. With it, torques of a redundant drive are without internal preload, like those that
             `predict_torque` returns; other robots have none.
 
