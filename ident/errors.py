@@ -16,6 +16,7 @@ IdentificationError
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
 ├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
+├── PlanUnfit             no moves within limits and time show every gain
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
     ├── EffectImpossible  the data give a declared effect a coefficient that physics does not allow
@@ -197,6 +198,17 @@ class PayloadUnseen(IdentificationError):
         )
         self.std_percent = std_percent
         self.runs = runs
+
+
+class PlanUnfit(IdentificationError):
+    """No moves within limits and time show every gain."""
+
+    def __init__(self, *, found: str, expected: str, remedy: str) -> None:
+        super().__init__(f"found {found}; expected {expected}; {remedy}")
+        self.subject = "the plan"
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
 
 
 class NotConverged(IdentificationError):
