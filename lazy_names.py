@@ -36,7 +36,14 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
             return list(homes())
         if name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}; it exports {', '.join(homes())}")
-        value = getattr(import_module(homes()[name]), name)
+        try:
+            module = import_module(homes()[name])
+        except ImportError as error:
+            found = shadowed_package()
+            if found:
+                raise ImportError(found, name=error.name, path=error.path) from error
+            raise
+        value = getattr(module, name)
         setattr(sys.modules[package], name, value)
         return value
 
@@ -44,6 +51,31 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
         return list(homes())
 
     return load, names
+
+
+PACKAGES = ("daq", "drivers", "ident")
+
+
+def shadowed_package() -> str:
+    """Describe a file or folder that Python has imported in the place of one of the packages; empty without one.
+
+    The names of the packages are common: a folder `drivers` beside a script comes before an installed package.
+    """
+    home = Path(__file__).resolve().parent
+    for name in PACKAGES:
+        module = sys.modules.get(name)
+        if module is None:
+            continue
+        file = getattr(module, "__file__", None)
+        place = Path(file or next(iter(module.__path__))).resolve()
+        if place.name == "__init__.py":
+            place = place.parent
+        if place != home / name:
+            return (
+                f"{name!r}: found {place}, which Python imports in the place of drivegain's package; expected "
+                f"{home / name}; rename {place.name!r}, or start Python in another folder"
+            )
+    return ""
 
 
 def _homes(source: bytes) -> dict[str, str]:

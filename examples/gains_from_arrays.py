@@ -53,7 +53,7 @@ def main() -> ident.Identification:
     """Identify and print."""
     model = ident.Model(ident.robot_from_urdf(URDF), ident.DriveTrain(np.diag(GEAR_RATIOS)))
     runs = [record(model, "bare", None, 1), record(model, "loaded", DISC, 2)]
-    found = ident.identify(model, runs, ident.Conditioning())
+    found = ident.identify(model, runs)
     for axis, (gain, std) in enumerate(zip(found.estimate.gains, found.estimate.gains_std, strict=True), start=1):
         print(f"J{axis}: {gain:7.2f} ± {std:.2f} Nm/A (true {TRUE_GAINS_NM_A[axis - 1]:.2f})")
     print(f"relative error of the torque: {found.training_error.total:.1f} %")

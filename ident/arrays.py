@@ -28,6 +28,8 @@ def as_array(
         raise refuse(f"{label} has shape {array.shape}; expected {shape}, {meaning}{turned}")
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
+        if array.ndim == 0:
+            raise refuse(f"{label} is {values!r}; expected an array of numbers")
         first = f"sample {bad[0][0]}" + (f", axis {bad[0][1] + 1}" if array.ndim > 1 else "")
         raise refuse(f"{label} holds {len(bad)} non-finite values, the first in {first}; give numbers")
     return array

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array
+from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
@@ -19,7 +21,7 @@ from ident.physical.full_set import FullSet
 if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.evidence import Evidence
     from ident.discovery.loop import Step
-    from ident.effects.effect import PlacedEffect
+    from ident.effects.effect import Effect, PlacedEffect
     from ident.estimators.estimate import Identification
 
 EXTRAPOLATED = 1.5
@@ -91,6 +93,9 @@ class AcceptedEffect:
     #: offset of the axis [rad; m], or gravity [m/s²]). None of other effects, where nothing in the description is
     #: corrected, and in calibrations of earlier versions.
     described: tuple[float, ...] | None = None
+    #: Name and version of the package that has the effect, or its module where no package has it: `module my_effects`.
+    #: None of an effect that drivegain ships.
+    package: str | None = None
 
     @property
     def is_confirmed(self) -> bool:
@@ -233,11 +238,23 @@ class Calibration:
     encoder_misfit: EncoderMisfit | None = None
     #: All standard parameters under a prior; None where none was asked for, and in calibrations of earlier versions.
     full_parameters: FullSet | None = None
+    #: Effects of one's own that were given as an argument, one of each name or more: predictions find them here. No
+    #: file has them; give them again to `daq.load_calibration`. An installed package needs no argument.
+    own_effects: tuple[Effect, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def places(self) -> tuple[str, ...]:
         """Names of the axes, then of the joints without a motor, as in `Robot.places`."""
         return (*(gain.axis for gain in self.gains), *self.passive_joints)
+
+    @property
+    def conditioning(self) -> Conditioning:
+        """Filters of the fit.
+
+        Raises:
+            ModelError: `filter` does not have them all.
+        """
+        return Conditioning.of_document(self.filter)
 
     @property
     def friction_by_payload(self) -> bool:
@@ -273,7 +290,7 @@ class Calibration:
 def calibration_of(
     found: Identification,
     axes: Sequence[str],
-    nameplate: Sequence[float] | FloatArray,
+    nameplate: ArrayLike,
     *,
     units: Sequence[str] = (),
     robot: str = "robot",
@@ -304,17 +321,18 @@ def calibration_of(
         effect = f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
         raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
+    nameplate_gains = np.atleast_1d(as_array("nameplate", nameplate))
     units = units or ("Nm/A",) * len(axes)
-    if not len(axes) == len(nameplate) == len(units) == len(estimate.gains):
+    if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
-            f"{len(axes)} axis names, {len(nameplate)} nameplate gains and {len(units)} units for "
+            f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} units for "
             f"{len(estimate.gains)} identified gains; expected one of each for each axis"
         )
     parameters = tuple(
         Parameter(column.name, float(value + column.about), float(std), column.unit)
         for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     )
-    identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
+    identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate_gains, strict=True)
     gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
     responses = mass_responses(found.system, estimate)
     undriven = found.model.robot.undriven_names
@@ -341,6 +359,7 @@ def calibration_of(
         covariance_factor=factor_of(estimate.covariance),
         current_residual=found.current_residual,
         passive_joints=undriven,
+        own_effects=() if last is None else _own_effects(last),
         payload_mass=tuple(
             PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist())
             for one in responses
@@ -363,6 +382,14 @@ def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
     return tuple(tuple(float(f"{value:.6g}") for value in row[: index + 1]) for index, row in enumerate(lower))
 
 
+def _own_effects(last: Evidence) -> tuple[Effect, ...]:
+    """Effects of the model that drivegain does not ship."""
+    # Who reads a calibration needs no effects.
+    from ident.effects.effect import is_shipped  # noqa: PLC0415
+
+    return tuple(placed.effect for placed in last.effects if not is_shipped(placed.effect))
+
+
 def _accepted(
     start: Identification,
     steps: Sequence[Step],
@@ -372,6 +399,7 @@ def _accepted(
 ) -> AcceptedEffect:
     # Who reads a calibration needs no effects.
     from ident.effects.geometry_corrections import is_correction  # noqa: PLC0415
+    from ident.effects.own import package_of  # noqa: PLC0415
 
     # The last turn that added it: an effect may have been dropped and added again.
     for number, step in reversed(list(enumerate(steps))):
@@ -409,6 +437,7 @@ def _accepted(
         error_after_percent=errors[1],
         ambiguity=tuple(rival.name_among(places) for rival in finding.ambiguity),
         largest_torque=_largest_torque(steps[-1].after, placed),
+        package=package_of(placed.effect),
     )
 
 

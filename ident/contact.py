@@ -130,7 +130,11 @@ class _Residual:
 
 
 def external_torque(
-    calibration: Calibration, model: Model, run: Run, conditioning: Conditioning, band: Band | None = None
+    calibration: Calibration,
+    model: Model,
+    run: Run,
+    conditioning: Conditioning | None = None,
+    band: Band | None = None,
 ) -> ExternalTorque:
     """Compute the external torque of a run.
 
@@ -138,7 +142,7 @@ def external_torque(
         calibration: of this robot; it knows the run's payload.
         model: the declared model that it was fitted with.
         run: any motion.
-        conditioning: the filters of the fit.
+        conditioning: the filters; those of the fit when None.
         band: from `prediction_band`. Without one, it is learned from the run itself, less the stretches of at most two
             seconds in which some joint is far out; this works while contacts fill less than a quarter of the run.
 
@@ -146,7 +150,7 @@ def external_torque(
         DataUnfit: the run is unfit, or no row of it counts.
         ModelError, EffectRefused: see `ident.predict_torque`.
     """
-    rows = _residual(calibration, model, run, conditioning)
+    rows = _residual(calibration, model, run, conditioning or calibration.conditioning)
     itself, left_out = band is None, 0
     if band is None:
         quiet, left_out = _quiet(rows)
@@ -159,7 +163,7 @@ def prediction_band(
     calibration: Calibration,
     model: Model,
     quiet: Iterable[Run],
-    conditioning: Conditioning,
+    conditioning: Conditioning | None = None,
     *,
     alarms_per_hour: float = ALARMS_PER_HOUR,
 ) -> Band:
@@ -174,7 +178,8 @@ def prediction_band(
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
     """
-    return _band([_residual(calibration, model, run, conditioning) for run in quiet], alarms_per_hour)
+    filters = conditioning or calibration.conditioning
+    return _band([_residual(calibration, model, run, filters) for run in quiet], alarms_per_hour)
 
 
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:

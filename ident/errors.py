@@ -16,8 +16,11 @@ IdentificationError
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
 ├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
+├── PlanUnfit             no moves within limits and time show every gain
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
+    ├── EffectImpossible  the data give a declared effect a coefficient that physics does not allow
+    └── EffectNotInstalled a calibration has an effect of a package that is not installed
 
 What leaves usable numbers is no error but a `Diagnosis`.
 """
@@ -197,6 +200,17 @@ class PayloadUnseen(IdentificationError):
         self.runs = runs
 
 
+class PlanUnfit(IdentificationError):
+    """No moves within limits and time show every gain."""
+
+    def __init__(self, *, found: str, expected: str, remedy: str) -> None:
+        super().__init__(f"found {found}; expected {expected}; {remedy}")
+        self.subject = "the plan"
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+
+
 class NotConverged(IdentificationError):
     """The iteration did not reach its optimum."""
 
@@ -217,6 +231,26 @@ class EffectRefused(IdentificationError):
 
 class EffectImpossible(EffectRefused):
     """The data give a declared effect a coefficient that physics does not allow."""
+
+
+class EffectNotInstalled(EffectRefused):
+    """A calibration has an effect of a package that is not installed."""
+
+    def __init__(self, effect: str, axis: str, package: str) -> None:
+        self.effect = effect
+        self.axis = axis
+        self.package = package
+        self.subject = f"effect {effect!r} on {axis}"
+        self.found = "no installed package that has it"
+        self.expected = f"{package}, which had it when the calibration was made"
+        if package.startswith("module "):
+            self.remedy = (
+                "give it as an argument (`own_effects`), or install it in a package with an entry point of the group "
+                "drivegain.effects"
+            )
+        else:
+            self.remedy = "install this package, or fit the logs again without it"
+        super().__init__(f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy}")
 
 
 CORRECTION_UNCLEAR = "correction-unclear"

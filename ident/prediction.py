@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
-from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
 from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.own import known_effect, known_names
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
-from ident.errors import DataUnfit, EffectRefused, ModelError
+from ident.errors import DataUnfit, EffectNotInstalled, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
@@ -116,14 +117,14 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
 
 
 def measured_torque(
-    calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion | None = None
+    calibration: Calibration, model: Model, current_a: ArrayLike, motion: Motion | None = None
 ) -> FloatArray:
     """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), shape (n_samples, n_axes) each.
 
     Args:
         calibration: with the gains.
         model: the declared model of the same robot.
-        current_a: of the motors.
+        current_a: of the motors; lists and data frames will do.
         motion: of the axes. With it, torques of a redundant drive are without internal preload, like those that
             `predict_torque` returns; other robots have none.
 
@@ -213,13 +214,15 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
         calibration: whose axes and joints these are.
 
     Raises:
+        EffectNotInstalled: the package that had the effect is not installed.
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
     places = calibration.places
-    families = {known.name: known for known in (*(family[0] for family in (*EFFECTS, *GEOMETRY)), *UNNAMED)}
-    if accepted.name not in families:
-        raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
-    known = families[accepted.name]
+    known = known_effect(accepted.name, calibration.own_effects)
+    if known is None:
+        if accepted.package is not None:
+            raise EffectNotInstalled(accepted.name, accepted.axis, accepted.package)
+        raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(known_names()))}")
     everywhere = not known.has_axis and accepted.axis == ALL_AXES
     if not everywhere and accepted.axis not in places:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(places)}")

@@ -191,7 +191,7 @@ def weigh(
     calibration: Calibration,
     model: Model,
     loaded: Iterable[Run],
-    conditioning: Conditioning,
+    conditioning: Conditioning | None = None,
     *,
     bare: Iterable[Run] = (),
 ) -> WeighedBody:
@@ -201,7 +201,7 @@ def weigh(
         calibration: gains, parameters and effects of this robot.
         model: the declared model that the calibration was fitted with.
         loaded: runs with the same body, mounted the same way.
-        conditioning: the filters of the calibration's fit.
+        conditioning: the filters; those of the calibration's fit when None.
         bare: runs of the same robot without load. With them, σ does not depend on the calibration's parameters.
 
     Raises:
@@ -209,6 +209,7 @@ def weigh(
         TooFewMoves: σ needs more moves.
         ModelError, EffectRefused: the calibration is of another robot, or holds an unknown effect.
     """
+    conditioning = conditioning or calibration.conditioning
     return weigh_rows(calibration, rows_to_weigh(model, loaded, conditioning, bare=bare))
 
 

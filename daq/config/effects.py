@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from daq.config.yaml_file import Fault
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import ADDED, Effect, GearSide, PlacedEffect, check_settings, is_placeable
+from ident.effects.own import installed_families
 from ident.errors import EffectRefused
 from ident.model.robot import Robot
 
@@ -21,10 +22,9 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
             added them.
         robot: that has it.
     """
-    families = {family[0].name: family[0] for family in EFFECTS}
-    if name not in families:
-        return Fault(("name",), f"{name!r}, and there is no such effect", f"one of {', '.join(families)}")
-    known = families[name]
+    known = _family_member(name)
+    if isinstance(known, Fault):
+        return known
     unknown = sorted(set(settings) - set(known.settings))
     if unknown:
         return Fault(("settings",), f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
@@ -42,6 +42,21 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
     if not is_placeable(effect, place, robot):
         return Fault(("axis",), "a place that this effect cannot have", _places(effect, place, robot))
     return PlacedEffect(effect, place)
+
+
+def _family_member(name: str) -> Effect | Fault:
+    """A member of the family of this name, of the dictionary or of an installed package."""
+    shipped = {family[0].name: family[0] for family in EFFECTS}
+    if name in shipped:
+        return shipped[name]
+    try:
+        installed = {own: one.family[0] for own, one in installed_families().items()}
+    except EffectRefused as error:
+        return Fault(("name",), str(error), "packages with effects that can be used")
+    if name in installed:
+        return installed[name]
+    names = ", ".join((*shipped, *installed))
+    return Fault(("name",), f"{name!r}, and there is no such effect", f"one of {names}")
 
 
 def _places(effect: Effect, place: int, robot: Robot) -> str:

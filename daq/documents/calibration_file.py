@@ -10,10 +10,10 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import AfterValidator, Field, model_validator
@@ -45,6 +45,9 @@ from ident.calibration import (
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
+
+if TYPE_CHECKING:  # reading a calibration needs no effects
+    from ident.effects.effect import Effect
 
 _LARGEST = 1e30  #: Size of a number, in any unit: products of three of them are still finite
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
@@ -107,6 +110,7 @@ class EffectEntry(StrictModel):
     ambiguity: tuple[str, ...]
     largest_torque: tuple[_Positive, ...] | None = None  # files of earlier versions lack it
     described: tuple[_Number, ...] | None = None  # likewise
+    package: str | None = None  # likewise
 
 
 class MassInfluenceEntry(StrictModel):
@@ -267,10 +271,14 @@ def _from_entry(entry: object) -> Any:
     if isinstance(entry, RelativeErrorEntry):
         return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
     made = _CLASSES.get(type(entry))
-    return entry if made is None else made(**{f.name: _from_entry(getattr(entry, f.name)) for f in fields(made)})
+    if made is None:
+        return entry
+    names = [field.name for field in fields(made) if field.name not in _OF_THE_PROCESS]
+    return made(**{name: _from_entry(getattr(entry, name)) for name in names})
 
 
 VERSION = 1
+_OF_THE_PROCESS = frozenset({"own_effects"})  #: Fields of a calibration that are code, and in no file
 _ENVELOPE = ("format", "version", "digests")
 _HEADER = """\
 # Made by drivegain. Each section carries its digest:
@@ -311,7 +319,8 @@ def as_document(calibration: Calibration) -> dict[str, Any]:
 
     Percentages of zero are None.
     """
-    return {field.name: _as_entry(getattr(calibration, field.name)) for field in fields(calibration)}
+    names = [field.name for field in fields(calibration) if field.name not in _OF_THE_PROCESS]
+    return {name: _as_entry(getattr(calibration, name)) for name in names}
 
 
 def _as_entry(value: Any) -> Any:
@@ -365,15 +374,20 @@ def encode_calibration(calibration: Calibration) -> bytes:
     return (_HEADER + text).encode()
 
 
-def load_calibration(path: Path) -> Calibration:
+def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibration:
     """Read a calibration.
+
+    Args:
+        path: of the file.
+        own_effects: effects of one's own that it may have and no installed package has; one of each name is enough.
 
     Raises:
         CalibrationMissing: the file does not exist, is a folder or a pipe, or cannot be read.
         CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or number, with its line.
         CalibrationRefused: the content was edited, with the names of the edited sections.
     """
-    return decode_calibration(read_calibration_bytes(path), str(path))
+    calibration = decode_calibration(read_calibration_bytes(path), str(path))
+    return replace(calibration, own_effects=tuple(own_effects))
 
 
 def read_calibration_bytes(path: Path) -> bytes:

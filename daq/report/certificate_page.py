@@ -240,6 +240,8 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
         f"{effect.axis} has {accepted_text(effect, calibration)}: {size_text(effect, calibration)}. {data}, the model "
         f"without it leaves {before} % of the torque of {effect.axis}, with it {after} %."
     )
+    if effect.package is not None:
+        text += paragraph(f"The effect {effect.name!r} is one of {effect.package}.")
     shown = curve_of(effect, calibration)
     if shown is None:
         return text

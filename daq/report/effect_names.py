@@ -12,7 +12,7 @@ from daq.report.gains import with_deviation
 from daq.report.text import SHOWN_SIGMAS
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect, is_shipped
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, Periodic, Smooth, is_unnamed
 from ident.errors import EffectRefused
@@ -50,7 +50,7 @@ WORDS = {
     "gravity-direction": "another direction of gravity than the cell file says",
     "late-position": "a position that is later than the others",
 }
-"""Words by family; an effect that is not listed is called by its name."""
+"""Words by family; an effect that is not listed has its own (`Effect.phrase`), or is called by its name."""
 
 _WHERE = {
     "stribeck": "below about {speed_rad_s:.2g} rad/s",
@@ -93,7 +93,7 @@ def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """Describe an effect, to follow "J3 has": `friction that grows with the load`."""
     if is_unnamed(effect):
         return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
-    words = WORDS.get(effect.name, f"the effect {effect.name!r}")
+    words = WORDS.get(effect.name) or effect.phrase or f"the effect {effect.name!r}"
     other = other_axis(effect)
     return words if other is None else words.replace("another joint", axes[other])
 
@@ -142,6 +142,8 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
     """Describe the size of a named effect from its coefficients, in the order of `effect.coefficients`."""
     names = [column.name for column in effect.coefficients]
     where = _WHERE.get(effect.name, "").format(**effect.settings)
+    if not is_shipped(effect):
+        where = ", ".join(f"{name} {value:.4g}" for name, value in effect.settings.items())
     if names == ["cosine", "sine"]:
         cosine, sine = found
         amplitude = math.hypot(cosine.value, sine.value)

@@ -86,7 +86,7 @@ def reduce_logs(
     model = model_of(reading.cell)
     conditioning = reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
-    rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
+    rest = each_run(reading.runs(holdout, "holdout"), set(), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
     return ReducedLogs(
         reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen, reading.geometry(model)

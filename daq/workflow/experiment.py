@@ -13,51 +13,35 @@ from daq.config.workspace import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
-from ident.data.conditioning import decimator
 from ident.model.robot import JointKind, Motion, Robot, poses
 from ident.planning.clear_way import farthest_towards
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.effort import believable_efforts, effort_shares
 from ident.planning.excitation import (
+    LAG_ONE,
+    NOISE_SHARE,
     Design,
     Excitation,
-    Expectation,
     declared_efforts,
-    effective_noise,
-    nominal_links,
-    nominal_parameters,
+    nominal_expectation,
     nominal_payload,
-    nominal_torque_limits,
+    rows_between_rests,
     side_of_cube,
     visible_base,
 )
 from ident.planning.gain_verdict import ExtraMoves
+from ident.planning.limits import JointLimits
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointLimits:
-    """Limits of the joints of a cell [rad; m of a prismatic joint], shape (n,) each."""
-
-    lower: FloatArray  #: least positions
-    upper: FloatArray  #: largest positions
-    velocity: FloatArray  #: per second
-    acceleration: FloatArray  #: per second squared
-
-    @classmethod
-    def of(cls, cell: Cell) -> JointLimits:
-        """Return the limits that a cell declares."""
-        limits = [axis.limits for axis in cell.axes]
-        return cls(
-            lower=np.array([one.position[0] for one in limits]),
-            upper=np.array([one.position[1] for one in limits]),
-            velocity=np.array([one.velocity for one in limits]),
-            acceleration=np.array([one.acceleration for one in limits]),
-        )
-
-    def targets(self) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the largest targets of a plan, which keep a margin from the limits."""
-        margin = POSITION_MARGIN * (self.upper - self.lower)
-        return self.lower + margin, self.upper - margin
+def limits_of(cell: Cell) -> JointLimits:
+    """Return the limits that a cell declares."""
+    limits = [axis.limits for axis in cell.axes]
+    return JointLimits(
+        lower=[one.position[0] for one in limits],
+        upper=[one.position[1] for one in limits],
+        velocity=[one.velocity for one in limits],
+        acceleration=[one.acceleration for one in limits],
+    )
 
 
 LINK_RADIUS = 0.08
@@ -117,7 +101,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     )
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     postures = np.random.default_rng(0).uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
     # Of a guessed shape, a pair that never keeps the distance belongs together as one that always touches does.
     is_guessed = [not declared.capsules or capsule.name == PAYLOAD for capsule in capsules]
@@ -157,11 +141,6 @@ def _point(vector: FloatArray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-NOISE_SHARE = 0.006
-"""Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
-current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
-LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
-RATE_HZ = 1000.0  #: Sampling rate that the rows are predicted for
 RUNS: tuple[int | None, ...] = (None, 0)  #: What is mounted while the moves are made: nothing, then the payload
 
 
@@ -247,21 +226,10 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     mounted = found[0]
     model = model_of(cell)
     expected = nominal_payload(model.robot, mounted.drawn)
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     fast_motion = _fast_motion(limits, Checker(model.robot, NOTHING))
-    links, from_urdf = nominal_links(model.robot, cell.urdf)
-    loaded = links.copy()
-    loaded[model.robot.carrier] += expected.parameters
-    torque = nominal_torque_limits(model, cell.urdf, loaded, fast_motion)
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
-    noise = NOISE_SHARE * (np.abs(model.drive_train.to_motor) * torque).max(axis=1) / np.abs(gains)
-    expectation = Expectation(
-        model=model,
-        gains=gains,
-        parameters=nominal_parameters(model, links, torque, limits.velocity, limits.acceleration),
-        payloads=(expected,),
-        noise_a=effective_noise(noise, LAG_ONE),
-    )
+    expectation, from_urdf = nominal_expectation(model, cell.urdf, gains, expected, limits, fast_motion)
     scene = scene_of(cell, model.robot, mounted.mass_kg)
     remarks = (
         f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
@@ -271,12 +239,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         *scene.remarks,
     )
     design = Design(expectation, visible_base(model, fast_motion))
-    # A row counts when its filter window is so far from a standstill that enough of its weight is outside.
-    filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
-    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
-    inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
-    period = filter_.factor / RATE_HZ
-    edge = max(filter_.half - inside, 0) / RATE_HZ
+    period, edge = rows_between_rests(cell.conditioning)
     declared = declared_efforts(model, cell.urdf)
     effort = believable_efforts(expectation, declared, fast_motion.position_rad, RUNS)
     remarks = (*remarks, *_effort_remarks(cell, declared, effort, from_urdf=from_urdf))
@@ -373,7 +336,7 @@ class PlannedMove:
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
     """The joint trapezoid of a move from the robot's position."""
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     velocity = limits.velocity * move.velocity
     acceleration = limits.acceleration * move.acceleration
     return synchronised(start_rad, np.array(move.target_rad), velocity, acceleration)
@@ -392,7 +355,6 @@ def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
 
 SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
 EXTRA_POSTURES = 300
-POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
 SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
 STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
 
@@ -405,7 +367,7 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     """
     cell = experiment.cell
     checker = experiment.scene.checker
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.closures:

@@ -49,7 +49,7 @@ from ident.discovery.evidence import Evidence, gather, with_effects, without_eff
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
 from ident.discovery.loop import Step, find_effects
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, EffectImpossible, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import EstimatorComparison, try_estimators
@@ -239,6 +239,7 @@ def fit_logs(
     effects: bool = True,
     created: datetime | None = None,
     progress: Callable[[str], None] = lambda _: None,
+    own_effects: Sequence[Effect] = (),
 ) -> Calibration:
     """Identify the gains from logs, detect and add missing effects, and return the calibration.
 
@@ -249,6 +250,7 @@ def fit_logs(
         effects: detect effects that the declared model lacks, and refit with those that pass.
         created: time stamp of the calibration, with its time zone; now when None.
         progress: receives a line for each step.
+        own_effects: effects that no installed package has, tried beside the others (`ident.Effect`).
 
     Raises:
         DataError: a log cannot be read, its samples cannot be used, or held-out runs refute the effects found.
@@ -263,7 +265,7 @@ def fit_logs(
         judge_holdout=not effects,
     )
     if effects:
-        fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
+        fitted = close_loop(fitted, BOOTSTRAP_SEED, progress, own_effects=own_effects)
         check_holdout(fitted)
     return calibration_of(fitted, created or datetime.now(UTC))
 
@@ -507,6 +509,7 @@ def close_loop(
     seed: int,
     progress: Callable[[str], None] = lambda _: None,
     undecided: Undecided = Undecided.LEFT_OUT,
+    own_effects: Sequence[Effect] = (),
 ) -> Fit:
     """Detect and add missing effects: refit with every effect that passes the gates and that held-out logs confirm.
 
@@ -516,6 +519,7 @@ def close_loop(
         progress: receives a line for each step.
         undecided: whether effects that held-out logs neither confirm nor refute join; all that were found join where
             `Undecided.ALL_JOIN` overrides the held-out logs.
+        own_effects: effects that no installed package has, tried beside the others.
 
     Raises:
         IdentificationError: a refit failed.
@@ -535,8 +539,9 @@ def close_loop(
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
     check = start.description
-    named = None if check is None else check.certain_mistakes
-    steps = find_effects(evidence, rng, progress=progress, axes=places, mistakes=named)
+    # The check of the fit has not compared its mistakes with the effects of an argument: it is made again.
+    named = None if check is None or own_effects else check.certain_mistakes
+    steps = find_effects(evidence, rng, progress=progress, axes=places, mistakes=named, own_effects=own_effects)
     if undecided is not Undecided.ALL_JOIN:
         join = undecided is Undecided.JOIN
         steps = accept_on_holdout(evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places)

@@ -28,10 +28,10 @@ from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION
 from daq.workflow.experiment import (
     CheckedScene,
     Experiment,
-    JointLimits,
     PlannedMove,
     experiment_duration_s,
     experiment_of,
+    limits_of,
     path_of,
     paths_of,
     scene_of,
@@ -608,7 +608,7 @@ def nearly_right_joints(robot: Robot) -> tuple[str, ...]:
 
 def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
     """Return the least and the largest targets: those of the joint limits, and inside a box."""
-    lower, upper = JointLimits.of(cell).targets()
+    lower, upper = limits_of(cell).targets()
     if box is None:
         return TargetBox(lower, upper)
     room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
@@ -621,7 +621,7 @@ def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
 
 def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
     """Return where targets may be: within the joint limits, and within a box but for the rounding of a plan file."""
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     if box is None:
         return TargetBox(limits.lower, limits.upper)
     rounding = np.array([axis.unit.si for axis in cell.axes]) * 10.0**-PLACES

@@ -27,7 +27,7 @@ from daq.log.feed import Feed, RunFacts
 from daq.log.metadata import Loss, RunInfo, RunStatistics, loss_reason, readback_of_drives
 from daq.log.motion import RecordedMotion
 from daq.log.writer import LogContent, LogWriter
-from daq.workflow.experiment import JointLimits, path_of
+from daq.workflow.experiment import limits_of, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.plan import Plan, check_way, way_to_first_target
@@ -376,7 +376,7 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits of the joints are
     checked in the plan.
     """
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     lower = limits.lower - scale.offset_rad
     upper = limits.upper - scale.offset_rad
     forwards = np.maximum(cell.ratio, 0.0)

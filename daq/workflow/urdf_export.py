@@ -12,7 +12,7 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit, SchemaMismatch
 from daq.formats.xml_document import Element, parse
-from daq.workflow.experiment import JointLimits
+from daq.workflow.experiment import limits_of
 from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
@@ -154,7 +154,7 @@ def _leading_motors(model: Model) -> tuple[list[int], Robot, Assembly]:
 
 def cell_limits(cell: Cell) -> FloatArray:
     """Middle and half of the range of each axis, and MOTION of its speed and acceleration, shape (4, n) [rad, s]."""
-    limits = JointLimits.of(cell)
+    limits = limits_of(cell)
     middle = 0.5 * (limits.lower + limits.upper)
     half_range = 0.5 * (limits.upper - limits.lower)
     return np.array([middle, half_range, MOTION * limits.velocity, MOTION * limits.acceleration])

@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -48,7 +47,7 @@ from ident.equations.instants import read_instants
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.rows import row_filter, row_masks
 from ident.equations.system import System
-from ident.errors import DataUnfit, Diagnosis, IdentificationError
+from ident.errors import DataUnfit, Diagnosis, IdentificationError, ModelError
 from ident.estimators.diagnosis import axis_error_diagnoses, exchanged_channels, scale_diagnoses
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.least_squares import wls
@@ -155,19 +154,16 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
     Raises:
         CalibrationUnreadable: they are not all there.
     """
-    expected = Conditioning().document()
-    found: dict[str, Any] = dict(calibration.filter)
-    lists = [name for name, value in found.items() if isinstance(value, list)]
-    if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
+    try:
+        return calibration.conditioning
+    except ModelError as error:
+        numbers = sorted(Conditioning().document().keys() - {"standstill_rad_s"})
         raise CalibrationUnreadable(
             f"calibration of cell {calibration.cell!r}, filter",
-            found=", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing",
-            expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
+            found=", ".join(f"{name}: {value}" for name, value in calibration.filter.items()) or "nothing",
+            expected=f"a list standstill_rad_s and numbers {', '.join(numbers)}",
             remedy="fit the logs again with this drivegain",
-        )
-    order = round(found.pop("position_order"))
-    speeds = tuple(found.pop("standstill_rad_s"))
-    return Conditioning(**found, position_order=order, standstill_rad_s=speeds)
+        ) from error
 
 
 def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:

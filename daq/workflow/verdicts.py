@@ -9,12 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from daq.errors import ConfigurationError
-from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
+from daq.workflow.experiment import experiment_of, extra_moves
 from daq.workflow.fit import Fit
 from ident.data.dataset import differentiate
 from ident.estimators.estimate import Identification
 from ident.model.bodies import LINK_PARAMETERS
-from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
+from ident.planning.excitation import (
+    LAG_ONE,
+    Design,
+    Excitation,
+    Expectation,
+    ExpectedPayload,
+    effective_noise,
+    recorded,
+)
 from ident.planning.gain_verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
 
 

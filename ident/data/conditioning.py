@@ -7,12 +7,18 @@ scipy.signal for them would take longer than fitting a minute of data. The tests
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 
 from ident.arrays import FloatArray, IntArray
+from ident.errors import ModelError
+
+FULL_FILTER_HZ = 125.0
+"""Sampling rate from which the usual cut-offs hold, that of a real arm in the tests; below, they fall with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +33,37 @@ class Conditioning:
     #: each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
     standstill_share: float = 0.1  #: a row is left out when standstill fills more than this share of its filter window
+
+    @classmethod
+    def for_rates(cls, rates_hz: Iterable[float]) -> Self:
+        """Return filters for recordings of some sampling rates: the usual ones, lower for slow recordings."""
+        share = min((1.0, *(rate_hz / FULL_FILTER_HZ for rate_hz in rates_hz)))
+        usual = cls()
+        return cls(
+            position_cutoff_hz=share * usual.position_cutoff_hz,
+            decimation_cutoff_hz=share * usual.decimation_cutoff_hz,
+        )
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, float | Iterable[float]]) -> Self:
+        """Return the filters that `document` has described.
+
+        Raises:
+            ModelError: a setting is missing, unknown, or no number.
+        """
+        expected = cls().document()
+        found: dict[str, Any] = dict(document)
+        lists = [name for name, value in found.items() if isinstance(value, list)]
+        if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
+            given = ", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing"
+            numbers = ", ".join(sorted(expected.keys() - {"standstill_rad_s"}))
+            raise ModelError(
+                f"the filter of the calibration: found {given}; expected a list standstill_rad_s and numbers "
+                f"{numbers}; give `conditioning`, or fit again"
+            )
+        order = round(found.pop("position_order"))
+        speeds = tuple(found.pop("standstill_rad_s"))
+        return cls(**found, position_order=order, standstill_rad_s=speeds)
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""

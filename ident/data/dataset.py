@@ -19,7 +19,7 @@ from ident.data.channel_faults import (
 from ident.data.clipping import clipped_samples
 from ident.data.conditioning import Conditioning, central_differences, low_pass
 from ident.data.held import HeldChannels, fill_held
-from ident.data.run import Run
+from ident.data.run import Run, usual_conditioning
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain
@@ -29,6 +29,9 @@ STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the 95 % quantile of the joint's speed."""
 STANDSTILL_SIGMAS = 6.0
 """Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
+
+SLOWEST_HZ = 10.0
+"""Sampling rate below which times are in another unit: no controller records the motion of an arm so rarely."""
 
 SETTLED_PERIODS = 4.0
 """Periods of the position low-pass after which its response to a wrong position is over: 1e-4 of it is left."""
@@ -72,18 +75,21 @@ class Dataset:
         return Motion(self.position_rad[part], self.velocity_rad_s[part], self.acceleration_rad_s2[part])
 
 
-def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
+def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning | None = None) -> Dataset:
     """Filter the positions without phase, then take central differences (paper §2.3).
 
     Args:
         run: a recording of n joints.
         drive_train: R, for the speed of coupled motors.
-        conditioning: cut-offs and standstill speeds; these are derived from the run where none are declared.
+        conditioning: cut-offs and standstill speeds; these are derived from the run where none are declared. Without
+            it, filters for the run's sampling rate (`Conditioning.for_rates`).
 
     Raises:
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
     """
     refuse = partial(DataUnfit, run.name)
+    if conditioning is None:
+        conditioning = usual_conditioning([run])
     time_s = as_array("time_s", run.time_s, refuse=refuse)
     if time_s.ndim != 1:
         raise refuse(f"time_s has shape {time_s.shape}; expected (n_samples,), one entry per sample")
@@ -233,6 +239,12 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     step = np.diff(run.time_s)
     if samples < 3 or np.any(step <= 0) or np.ptp(step) > 0.01 * float(np.median(step)):
         raise refuse("the sampling times are not uniform; derivatives need a constant rate without gaps")
+    if run.rate_hz < SLOWEST_HZ:
+        between_s = (run.time_s[-1] - run.time_s[0]) / (samples - 1)
+        raise refuse(
+            f"time_s has {between_s:g} s between samples; expected seconds, and at most {1.0 / SLOWEST_HZ:g} s; "
+            "if these are milliseconds, divide them by 1000"
+        )
     lowest, highest = sorted((conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz))
     if not lowest > 0.0:
         raise refuse(f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning")

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueChannel
 from ident.model.bodies import Payload
 
@@ -31,9 +37,9 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One recording of n joints over k samples at a constant rate."""
+    """One recording of n joints over k samples at a constant rate; lists and data frames will do for arrays."""
 
-    name: str  #: for messages and reports (the log's stem)
+    name: str  #: for messages and reports (the log's stem); another one for each run that is of no log
     time_s: FloatArray  #: time of each sample [s], shape (k,), uniform
     position_rad: FloatArray  #: joint positions [rad; m for a prismatic joint], shape (k, n)
     #: Input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is Nm at the
@@ -55,7 +61,42 @@ class Run:
     #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses; empty without any.
     torque_channels: tuple[TorqueChannel, ...] = ()
 
+    if TYPE_CHECKING:  # whatever becomes an array: the fields are converted where they are first used
+
+        def __init__(
+            self,
+            name: str,
+            time_s: ArrayLike,
+            position_rad: ArrayLike,
+            current_a: ArrayLike,
+            payload: Payload | None = None,
+            move: ArrayLike | None = None,
+            digest: str = "",
+            valid: ArrayLike | None = None,
+            started_s: float | None = None,
+            partial: bool = False,
+            recording: Recording | None = None,
+            temperature_c: ArrayLike | None = None,
+            torque_channels: tuple[TorqueChannel, ...] = (),
+        ) -> None: ...
+
     @property
     def rate_hz(self) -> float:
         """Sampling rate [Hz]."""
         return float((len(self.time_s) - 1) / (self.time_s[-1] - self.time_s[0]))
+
+
+def usual_conditioning(runs: Iterable[Run]) -> Conditioning:
+    """Return the filters for some runs where the caller gives none: see `Conditioning.for_rates`.
+
+    A run whose times are none does not count: `ident.data.dataset.differentiate` refuses it.
+    """
+    rates_hz: list[float] = []
+    for run in runs:
+        try:
+            time_s = np.asarray(run.time_s, dtype=np.float64)
+        except (TypeError, ValueError):
+            continue
+        if time_s.ndim == 1 and len(time_s) > 1 and 0.0 < time_s[-1] - time_s[0] < np.inf:
+            rates_hz.append(float((len(time_s) - 1) / (time_s[-1] - time_s[0])))
+    return Conditioning.for_rates(rates_hz)

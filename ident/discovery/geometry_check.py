@@ -36,7 +36,7 @@ from ident.discovery.late_currents import (
 )
 from ident.discovery.pairs_of_zeros import PairOfZeros, pairs_that_pass, try_pairs
 from ident.discovery.search import Finding, rank_families
-from ident.effects.dictionary import EFFECTS, GEOMETRY
+from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.geometry_corrections import (
@@ -46,6 +46,7 @@ from ident.effects.geometry_corrections import (
     ZeroOffset,
     turned_gravity,
 )
+from ident.effects.own import search_families
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.rows import at_rows
 from ident.errors import TooFewMoves
@@ -202,27 +203,35 @@ class _Rivals:
         return problem.torque_at_rows(found.effect, found.axis)
 
 
-def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | None = None) -> GeometryCheck:
+def check_geometry(
+    evidence: Evidence,
+    rng: np.random.Generator,
+    gates: Gates | None = None,
+    own_effects: Sequence[Effect] = (),
+) -> GeometryCheck:
     """Test geometry and clock beside a fit.
 
     Args:
         evidence: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
         gates: limits for a mistake, those of a search; its share of one motor's residual is not among them.
+        own_effects: that a mistake competes with, beside those of the dictionary and of installed packages.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
+        EffectRefused: an effect of another package cannot be used.
     """
+    families = search_families(own_effects)
     # What the arm does wrong is spread over all motors, and a delay is judged by its length.
     gates = replace(gates or Gates(), explained=0.0, error_fall=0.0)
-    first = _tested_once(evidence, rng, gates)
+    first = _tested_once(evidence, families, rng, gates)
     rounds = [first]
     while len(rounds) < MOST_ROUNDS:
         settled = rounds[-1].settled
         if settled is None:
             break
         try:
-            rounds.append(_tested_once(settled.corrected, rng, gates))
+            rounds.append(_tested_once(settled.corrected, families, rng, gates))
         except TooFewMoves:  # of the corrected description, other moves may be valid
             break
     mistakes = _in_one_fit(rounds)
@@ -236,7 +245,9 @@ def check_geometry(evidence: Evidence, rng: np.random.Generator, gates: Gates | 
     )
 
 
-def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> _Round:
+def _tested_once(
+    evidence: Evidence, families: Sequence[Sequence[Effect]], rng: np.random.Generator, gates: Gates
+) -> _Round:
     """Test geometry and clock once; what the model has in it already is not tested.
 
     Raises:
@@ -257,7 +268,7 @@ def _tested_once(evidence: Evidence, rng: np.random.Generator, gates: Gates) -> 
     findings = rank_families(problem, tested, rng, gates)
     suspects = _suspects(problem, findings, of_currents, rates_nm_s)
     of_pairs = tuple(_Suspect.of_pair(problem, pair) for pair in wrong_pairs)
-    rivals = _rivals(evidence, problem, tested, (*suspects, *of_pairs), rng, gates)
+    rivals = _rivals(evidence, problem, families, tested, (*suspects, *of_pairs), rng, gates)
     # A pair explains more than one zero does, whether it is needed or not.
     settled = _first_that_stands(evidence, problem, suspects, rivals)
     if settled is None:
@@ -396,6 +407,7 @@ def _suspects(
 def _rivals(
     evidence: Evidence,
     problem: SearchProblem,
+    families: Sequence[Sequence[Effect]],
     tested: Sequence[FamilyTrials],
     suspects: Sequence[_Suspect],
     rng: np.random.Generator,
@@ -406,17 +418,17 @@ def _rivals(
     A late current or position also competes with what is fast on its axis: presliding, a gear with a gap or a spring in
     it.
     """
-    families = (*tested, *_tested(problem, _slow(EFFECTS)))
+    slow = (*tested, *_tested(problem, _slow(families)))
     late: set[int] = set()
     for suspect in suspects:
         late |= {one.axis for one in suspect.effects if isinstance(one.effect, CLOCK) and one.effect.has_axis}
-    at_full_rate = _columns_at_full_rate(evidence, sorted(late)) if late else {}
+    at_full_rate = _columns_at_full_rate(evidence, families, sorted(late)) if late else {}
     of_fast = problem.trials(at_full_rate.values())
     fast: list[FamilyTrials] = []
     for placed, trial in zip(at_full_rate, of_fast, strict=True):
         if trial is not None:
             fast.append(FamilyTrials(placed.axis, ((placed.effect, trial),)))
-    return _Rivals(rank_families(problem, (*families, *fast), rng, gates), at_full_rate)
+    return _Rivals(rank_families(problem, (*slow, *fast), rng, gates), at_full_rate)
 
 
 def _first_that_stands(
@@ -614,13 +626,15 @@ def _fast(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
     return tuple(found)
 
 
-def _columns_at_full_rate(evidence: Evidence, axes: Sequence[int]) -> dict[PlacedEffect, FloatArray]:
+def _columns_at_full_rate(
+    evidence: Evidence, families: Sequence[Sequence[Effect]], axes: Sequence[int]
+) -> dict[PlacedEffect, FloatArray]:
     """Columns of the fast effects of some axes at the joints, shape (m, p, r) each."""
     model = evidence.model
     conditioning = evidence.conditioning
     began_s = session_began_s(evidence.fit_runs)
     placed: list[PlacedEffect] = []
-    for family in _fast(EFFECTS):
+    for family in _fast(families):
         for axis in axes:
             placed += [PlacedEffect(one, axis) for one in family if is_placeable(one, axis, model.robot)]
     parts: dict[PlacedEffect, list[FloatArray]] = {one: [] for one in placed}

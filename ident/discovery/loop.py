@@ -55,8 +55,9 @@ from ident.discovery.search import (
     refine_setting,
 )
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
-from ident.effects.dictionary import EFFECTS, GEOMETRY
+from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.own import families_of, search_families
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
 from ident.effects.unnamed import is_unnamed
@@ -99,11 +100,12 @@ def find_effects(
     start: Evidence,
     rng: np.random.Generator,
     gates: Gates | None = None,
-    families: tuple[tuple[Effect, ...], ...] = EFFECTS,
-    progress: Callable[[str], None] = lambda _: None,
+    families: tuple[tuple[Effect, ...], ...] | None = None,
+    progress: Callable[[str], None] | None = None,
     axes: Sequence[str] = (),
-    geometry: tuple[tuple[Effect, ...], ...] = GEOMETRY,
+    geometry: tuple[tuple[Effect, ...], ...] | None = None,
     mistakes: Sequence[Finding] | None = None,
+    own_effects: Sequence[Effect] = (),
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
@@ -141,21 +143,35 @@ def find_effects(
         start: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
         gates: limits for a candidate.
-        families: the dictionary.
+        families: that are tried, the members of each with the settings to begin with; when None, the dictionary and
+            those of installed packages.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
-        geometry: the part of the dictionary that corrects the description of the robot.
+        geometry: the part of the dictionary that corrects the description of the robot; when None, all of it.
         mistakes: that the check has named beside this start; when None, and there is a geometry, it is made here.
+        own_effects: effects that no installed package has, tried beside the families; several of one name are one
+            family. They take the place of installed ones of the same name.
 
     Returns:
         the turns taken, one of each mistake that has joined among them; the last one has accepted nothing, unless
         MAX_EFFECTS was reached.
+
+    Raises:
+        EffectRefused: an effect of another package cannot be used.
     """
     gates = gates or Gates()
+    if progress is None:
+        progress = _ignore
+    if geometry is None:
+        geometry = GEOMETRY
+    if families is None:
+        families = search_families(own_effects)
+    else:
+        families = (*families, *families_of(own_effects, "`own_effects`"))
     names = axes or [joint.name for joint in start.model.robot.places]
     steps: list[Step] = []
     if mistakes is None:
-        mistakes = _named_mistakes(start, rng, gates) if geometry else ()
+        mistakes = _named_mistakes(start, rng, gates, own_effects) if geometry else ()
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
     delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
     corrected = start
@@ -172,7 +188,7 @@ def find_effects(
     found, model = search(corrected, MAX_EFFECTS)
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
-        late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates), rng, gates)
+        late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates, own_effects), rng, gates)
         aside += late.set_aside
         if late.joined:
             *found, last = found  # a turn that has found nothing is the last one of all
@@ -226,11 +242,17 @@ def _searched(
     return steps, model
 
 
-def _named_mistakes(start: Evidence, rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
+def _ignore(_line: str) -> None:
+    """Take a line of progress that nobody reads."""
+
+
+def _named_mistakes(
+    start: Evidence, rng: np.random.Generator, gates: Gates, own_effects: Sequence[Effect]
+) -> tuple[Finding, ...]:
     """What the check of the description and of the clock names for certain; nothing with too few moves."""
     (own,) = rng.spawn(1)  # the draws of the search stay what they are
     try:
-        return check_geometry(start, own, gates).certain_mistakes
+        return check_geometry(start, own, gates, own_effects).certain_mistakes
     except TooFewMoves:
         return ()
 

@@ -35,9 +35,9 @@ from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProbl
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, certain_delays, impossible
 from ident.discovery.refinement import refine_together
-from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
+from ident.effects.own import search_families
 from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
 
 EffectKey = tuple[str, int, tuple[float, ...]]
@@ -92,15 +92,19 @@ def rank_effects(
     search_problem: SearchProblem,
     rng: np.random.Generator,
     gates: Gates | None = None,
-    families: tuple[tuple[Effect, ...], ...] = EFFECTS,
+    families: tuple[tuple[Effect, ...], ...] | None = None,
     proposed: Mapping[int, tuple[tuple[Effect, ...], ...]] | None = None,
     known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
     """Test all families on all axes and rank them, the best on held-out moves first.
 
+    Without families, these are those of the dictionary and of installed packages.
+
     What is proposed for an axis takes the place of the families of the same name there. ``known`` are names of effects
     in the model: see `rank_families`.
     """
+    if families is None:
+        families = search_families()
     tested: list[FamilyTrials] = []
     for axis in range(len(search_problem.model.robot.places)):
         own = (proposed or {}).get(axis, ())

@@ -71,10 +71,29 @@ AxisNumber = Annotated[int, Range(0, math.inf)]  #: Number of another axis, from
 
 @dataclass(frozen=True, slots=True)
 class Effect(ABC):
-    """An entry of the dictionary: a frozen dataclass whose fields with a `Range` are its searched parameters.
+    """A torque Σ c_k φ_k [Nm; N] that the declared model lacks; derive from it to add an effect of your own.
 
-    The docstring of an effect states the equation, its source and the signature: how the residual shows it. A subclass
-    sets `name`, `declares`, `abscissa` and `coefficients`, and defines `columns`.
+    A subclass is a frozen dataclass. It sets `name`, `declares`, `abscissa` and `coefficients`, and defines `columns`,
+    the φ_k. The torque is what the motors must supply, at the joint: a positive coefficient with a positive column
+    needs more current in the positive direction. Its fields, each with a `Range`, are its searched parameters, with
+    units in their names. Its docstring states equation, sign, source and signature: how the residual shows it.
+
+    The other properties say where and when it is tried; their defaults are those of a torque on one driven joint. A
+    search tries it where a package registers it by the entry point group `drivegain.effects`, or where it is in
+    `own_effects` of `find_effects`.
+
+    Example::
+
+        @dataclass(frozen=True, slots=True)
+        class SquareDrag(ident.Effect):
+            name = "square-drag"
+            declares = ident.Property.ODD_IN_VELOCITY
+            abscissa = ident.Abscissa.VELOCITY
+            coefficients = (ident.Column("drag", "Nm/(rad/s)^2", least=0.0),)
+
+            def columns(self, signals, axis):
+                velocity_rad_s = signals.velocity_rad_s[axis]
+                return (velocity_rad_s * np.abs(velocity_rad_s))[None]
     """
 
     @property
@@ -96,6 +115,11 @@ class Effect(ABC):
     @abstractmethod
     def coefficients(self) -> tuple[Column, ...]:
         """Name, unit and possible values of each linear parameter."""
+
+    @property
+    def phrase(self) -> str:
+        """Words for reports, to follow "J3 has": `friction that grows with the load`; its name where empty."""
+        return ""
 
     @property
     def side(self) -> GearSide:
@@ -301,12 +325,46 @@ def effect_columns(
     return np.concatenate(parts, axis=-1)
 
 
+def is_shipped(effect: Effect) -> bool:
+    """Whether an effect is one of this package, and not one's own."""
+    return type(effect).__module__.startswith(f"{__package__}.")
+
+
 def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
-    """Columns of an effect where it is placed; on a joint without a motor, as torques of all axes, (m, p, k)."""
-    columns, count = effect.columns(signals, axis), len(signals.current_a)
+    """Columns of an effect where it is placed; on a joint without a motor, as torques of all axes, (m, p, k).
+
+    Raises:
+        EffectRefused: an effect of one's own returns columns of another shape, or a number that is not finite.
+    """
+    columns = effect.columns(signals, axis)
+    count = len(signals.current_a)
+    if not is_shipped(effect):
+        columns = _checked_columns(effect, columns, signals, count)
     if axis < count:
         return columns
     return np.asarray(signals.leverage[axis - count][:, None] * columns)
+
+
+_SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
+"""Shape of an effect's columns before (p, k), by where the torque acts; (m,) elsewhere."""
+
+
+def _checked_columns(effect: Effect, columns: object, signals: Signals, count: int) -> FloatArray:
+    """Columns of an effect of one's own as numbers; refused where their shape is wrong or one is not finite."""
+    found = np.asarray(columns, dtype=np.float64)
+    ahead = _SHAPES.get(effect.side, (count,))
+    expected = (*ahead, len(effect.coefficients), len(signals.time_s))
+    if found.shape != expected:
+        raise EffectRefused(
+            f"effect {effect.name!r}: found columns of shape {found.shape}; expected {expected}, the last two for "
+            "coefficients and samples; correct its method `columns`"
+        )
+    if not np.isfinite(found).all():
+        raise EffectRefused(
+            f"effect {effect.name!r}: found columns with numbers that are not finite; expected a torque for every "
+            "sample; correct its method `columns`, or return False from `fits_in` where it lacks a signal"
+        )
+    return found
 
 
 def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
+from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, as_array
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -75,8 +76,8 @@ ALIKE = 0.25  #: Least squared correlation of two torques of which one is the ot
 def diagnose(
     found: Identification,
     axes: Sequence[str],
-    nameplate: FloatArray | None = None,
-    effort_limit: FloatArray | None = None,
+    nameplate: ArrayLike | None = None,
+    effort_limit: ArrayLike | None = None,
 ) -> tuple[Diagnosis, ...]:
     """Judge a fit: refuse mistakes that leave no usable number, and name all others.
 
@@ -94,7 +95,14 @@ def diagnose(
         JointStill: a joint never moves in a run, in place of an error that this explains.
     """
     with with_channel_causes(found.channels, axes):
-        return tuple(_diagnoses(found, axes, nameplate, effort_limit))
+        return tuple(
+            _diagnoses(
+                found,
+                axes,
+                None if nameplate is None else as_array("nameplate", nameplate, (len(axes),), "one per axis"),
+                None if effort_limit is None else np.asarray(effort_limit, dtype=np.float64),
+            )
+        )
 
 
 TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}

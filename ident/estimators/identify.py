@@ -7,11 +7,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.data.run import Run
+from ident.data.run import Run, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
@@ -41,11 +42,11 @@ from ident.model.model import Model
 def identify(
     model: Model,
     runs: Iterable[Run],
-    conditioning: Conditioning,
+    conditioning: Conditioning | None = None,
     *,
     holdout: Iterable[Run] = (),
     method: Method | str = Method.ML,
-    fixed_gains: FloatArray | None = None,
+    fixed_gains: ArrayLike | None = None,
     keep_rows: bool = False,
     judge: bool = True,
     axes: Sequence[str] | None = None,
@@ -55,7 +56,8 @@ def identify(
     Args:
         model: the declared model.
         runs: of the fit: without load, and with a weighed payload where the gains are free.
-        conditioning: the filters.
+        conditioning: the filters; when None, those for the slowest of ``runs`` (`Conditioning.for_rates`), which are
+            then all read before the first is used.
         holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
         method: estimator, or its name.
         fixed_gains: known gains, shape (m,).
@@ -70,17 +72,20 @@ def identify(
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
         CurrentConstant, ReadingsDamaged: see `ident.data.run_channels`.
         JointStill: a joint never moves in a run, and the fit has no usable number for that.
-        DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
+        DataUnfit: two runs have one name; or see reduction.
+        RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
+    names: set[tuple[str, str]] = set()
+    runs = each_run(runs, names)
+    if conditioning is None:
+        runs = list(runs)
+        conditioning = usual_conditioning(runs)
     require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
     method = Method(method)
-    if fixed_gains is not None:
-        fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
-        if not fixed_gains.all():
-            raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
+    known_gains = _known_gains(fixed_gains, model)
     axes = axes or [joint.name for joint in model.robot.axes]
-    used = with_signed_currents(each_run(runs), model, conditioning, axes)
+    used = with_signed_currents(runs, model, conditioning, axes)
     instants: list[Instants] = []
     channels: list[RunChannels] = []
     kept: list[BuiltRun] = []
@@ -96,22 +101,22 @@ def identify(
     system = regrouped(standard)
     del standard  # its clusters hold every column
     with with_channel_causes(channels, axes):
-        require_distinct(system, gains=fixed_gains is None)
-        estimate = estimate_with(method, system, fixed_gains)
+        require_distinct(system, gains=known_gains is None)
+        estimate = estimate_with(method, system, known_gains)
         jackknifed = estimate
-        if fixed_gains is None:
+        if known_gains is None:
             # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that
             # moves contradict each other; ml's do, where it has an estimate.
             with suppress(IdentificationError):
                 jackknifed = estimate if method.is_of_currents else ml(system)
             require_seen_payload(jackknifed, system)
-        if fixed_gains is not None:
+        if known_gains is not None:
             require_weight(system, estimate)
             require_signs(system, estimate, axes)
         if judge:
             idle = idle_joints(model, *joint_torques(system, estimate))
             require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    left_out = with_signed_currents(each_run(holdout, system.payloads), model, conditioning, axes)
+    left_out = with_signed_currents(each_run(holdout, names, system.payloads), model, conditioning, axes)
     built = noting_channels(rows_of_runs(model, left_out, conditioning), model, axes, [])
     rest = reduce_built(model, keeping(built, kept) if keep_rows else built, payloads=system.payloads)
     unseen = regrouped(rest, system.base, system.payload_columns) if rest.runs else None
@@ -124,7 +129,17 @@ def identify(
     observation = observe(model, datasets, conditioning, system, [rows for _, rows in kept])
     found = replace(found, gathered=(datasets, observation))
     limits = limited_currents(observation, estimate)
-    return _without_limited_currents(found, datasets, limits, fixed_gains) if limits else found
+    return _without_limited_currents(found, datasets, limits, known_gains) if limits else found
+
+
+def _known_gains(fixed_gains: ArrayLike | None, model: Model) -> FloatArray | None:
+    """Gains that a caller holds fixed, shape (m,); None where they are free."""
+    if fixed_gains is None:
+        return None
+    gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
+    if not gains.all():
+        raise ModelError(f"fixed_gains is {gains.tolist()}; expected no zero: such a motor moves nothing")
+    return gains
 
 
 def _without_limited_currents(
@@ -212,11 +227,22 @@ def keeping(built: Iterable[tuple[Dataset, Iterable[Rows]]], kept: list[BuiltRun
         yield data, rows
 
 
-def each_run(runs: Iterable[Run], payloads: tuple[Payload, ...] | None = None) -> Iterator[Run]:
-    """Yield runs with a known mounting, or with any; refuse anything else."""
+def each_run(
+    runs: Iterable[Run], names: set[tuple[str, str]], payloads: tuple[Payload, ...] | None = None
+) -> Iterator[Run]:
+    """Yield runs with a known mounting, or with any; refuse anything else.
+
+    Args:
+        runs: of a caller.
+        names: of the runs so far, to which theirs are added. No two may have one, unless they are of different logs.
+        payloads: with the known mountings; None where any is allowed.
+    """
     require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
     for run in runs:
         require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+        if (run.name, run.digest) in names:
+            raise DataUnfit(run.name, "found two runs of this name; expected another name for each; rename one")
+        names.add((run.name, run.digest))
         if run.payload is not None:
             require_kind(f"payload of {run.name!r}", run.payload, Payload, "write Payload(name, mounting, known)")
             if payloads is not None and run.payload.mounting not in (known.mounting for known in payloads):

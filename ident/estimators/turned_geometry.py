@@ -34,8 +34,9 @@ from itertools import product
 
 import numpy as np
 import scipy  # loads its modules when they are first used
+from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, IntArray
+from ident.arrays import FloatArray, IntArray, as_array
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.instants import Instants
@@ -238,7 +239,7 @@ def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
     return replace(model, robot=replace(model.robot, gravity_m_s2=gravity_m_s2))
 
 
-def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: FloatArray) -> TurnedGeometry | None:
+def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: ArrayLike) -> TurnedGeometry | None:
     """Look for another geometry that explains recordings clearly better than the declared one.
 
     Args:
@@ -252,7 +253,8 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     """
     if model.is_redundant or not instants:
         return None
-    reference = 1.0 / np.abs(gains)
+    nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")
+    reference = 1.0 / np.abs(nameplate)
     if not _is_suspect(model, _thinned(instants), reference):
         return None
     weighed = gravity_products(model, instants)
@@ -275,12 +277,12 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Floa
     alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
     # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a zero half a turn away
     # explains the same as another gravity, the mounting is named first: it is declared once for the whole arm.
-    alike.sort(key=lambda one: (one.contradictions(gains), one.gravity is None, -one.fall(before)))
+    alike.sort(key=lambda one: (one.contradictions(nameplate), one.gravity is None, -one.fall(before)))
     chosen = alike[0]
-    fewest = chosen.contradictions(gains)
+    fewest = chosen.contradictions(nameplate)
     alike += [one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)]
-    readings = [one.reading for one in alike if one.reading is not None and one.contradictions(gains) == fewest]
-    against = np.flatnonzero(chosen.fit.per_unit * gains < 0.0)
+    readings = [one.reading for one in alike if one.reading is not None and one.contradictions(nameplate) == fewest]
+    against = np.flatnonzero(chosen.fit.per_unit * nameplate < 0.0)
     return TurnedGeometry(
         gravity=chosen.gravity,
         readings=tuple(readings),

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.errors import ModelError
@@ -35,6 +37,10 @@ class DriveTrain:
     """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24)."""
 
     ratio: FloatArray  #: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do
+
+    if TYPE_CHECKING:  # whatever becomes an array
+
+        def __init__(self, ratio: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         ratio = as_array("the drive train", self.ratio)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array
 
 
 class JointKind(Enum):
@@ -152,11 +154,29 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint]."""
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
+
+    Lists and data frames will do for arrays.
+
+    Raises:
+        ModelError: one is no array of numbers.
+    """
 
     position_rad: FloatArray  #: q
     velocity_rad_s: FloatArray  #: q̇, per s
     acceleration_rad_s2: FloatArray  #: q̈, per s²
+
+    if TYPE_CHECKING:  # whatever becomes an array
+
+        def __init__(
+            self, position_rad: ArrayLike, velocity_rad_s: ArrayLike, acceleration_rad_s2: ArrayLike
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2"):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray):
+                object.__setattr__(self, name, as_array(f"{name} of the motion", value))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.pivots import cut_pivots
@@ -100,6 +100,7 @@ def robot_from_urdf(
                 raise ModelError(f"{what} names joint {name!r}; the URDF has the moving joints {', '.join(index)}")
     closed = []
     for pair in closures:
+        require_kind("an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)")
         what = f"closure {pair.name!r}"
         unknown = [direction for direction in pair.directions if direction not in DIRECTIONS]
         if unknown or not pair.directions or len(set(pair.directions)) < len(pair.directions):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.arrays import BoolArray, FloatArray
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, decimator
 from ident.data.dataset import Dataset
 from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
@@ -29,6 +29,7 @@ from ident.model.bodies import LINK_PARAMETERS, Body, Payload
 from ident.model.model import Model, preload_directions
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
+from ident.planning.limits import JointLimits
 
 IntArray = NDArray[np.intp]
 
@@ -43,6 +44,11 @@ ROTOR = 0.03
 """Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit;
 typical of geared arms (paper, Table 3)."""
 LARGEST_EFFORT = 1e6  #: [Nm or N]; some exporters write 0, others 1e9 for an effort that is not known
+NOISE_SHARE = 0.006
+"""Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
+current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
+LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
+RATE_HZ = 1000.0  #: Sampling rate that the rows are predicted for
 TORQUE_RESERVE = 3.0  #: Torque limit over the largest rigid-body torque, where the URDF gives none
 
 
@@ -311,9 +317,53 @@ class Design:
         return np.asarray(100.0 * np.sqrt(variance))
 
 
-def nominal_links(robot: Robot, urdf: str) -> tuple[FloatArray, bool]:
+def rows_between_rests(conditioning: Conditioning) -> tuple[float, float]:
+    """Return the time between two rows of a fit, and how long after a rest rows begin to count [s].
+
+    A row counts when its filter window is so far from a standstill that enough of its weight is outside.
+    """
+    filter_ = decimator(RATE_HZ, conditioning.decimation_cutoff_hz)
+    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
+    inside = int(np.searchsorted(weight, conditioning.standstill_share))
+    return filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+
+
+def nominal_expectation(
+    model: Model,
+    urdf: str | None,
+    gains: FloatArray,
+    payload: ExpectedPayload,
+    limits: JointLimits,
+    fast_motion: Motion,
+) -> tuple[Expectation, bool]:
+    """Return the robot that is expected before a fit, and whether the URDF contains the masses of its links.
+
+    Args:
+        model: the declared model.
+        urdf: text of the URDF; None where there is none.
+        gains: by the data sheet, shape (n,).
+        payload: that will be mounted.
+        limits: of the joints.
+        fast_motion: motion as fast as the limits allow.
+    """
+    links, from_urdf = nominal_links(model.robot, urdf)
+    loaded = links.copy()
+    loaded[model.robot.carrier] += payload.parameters
+    torque = nominal_torque_limits(model, urdf, loaded, fast_motion)
+    noise = NOISE_SHARE * (np.abs(model.drive_train.to_motor) * torque).max(axis=1) / np.abs(gains)
+    expectation = Expectation(
+        model=model,
+        gains=gains,
+        parameters=nominal_parameters(model, links, torque, limits.velocity, limits.acceleration),
+        payloads=(payload,),
+        noise_a=effective_noise(noise, LAG_ONE),
+    )
+    return expectation, from_urdf
+
+
+def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
     """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them; else rods."""
-    bodies = read_urdf(urdf).bodies
+    bodies = () if urdf is None else read_urdf(urdf).bodies
     if any(body.mass_kg > 0.0 for body in bodies):
         return np.array([body.parameters for body in bodies]), True
     links = []
@@ -349,14 +399,16 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     return ExpectedPayload(frozenset(payload.known), parameters)
 
 
-def declared_efforts(model: Model, urdf: str) -> FloatArray:
+def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
     """Return the effort limit of each axis in the URDF [Nm or N], shape (n,); inf where it is not known."""
+    if urdf is None:
+        return np.full(model.robot.axis_count, np.inf)
     declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
     is_known = (declared > 0.0) & (declared < LARGEST_EFFORT)
     return np.where(is_known, declared, np.inf)
 
 
-def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motion: Motion) -> FloatArray:
+def nominal_torque_limits(model: Model, urdf: str | None, links: FloatArray, fast_motion: Motion) -> FloatArray:
     """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque, shape (n,).
 
     Args:

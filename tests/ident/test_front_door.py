@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import runpy
 import subprocess
 import sys
+import textwrap
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ident
+from ident.arrays import FloatArray
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -24,7 +30,8 @@ def example() -> SimpleNamespace:
 
 def test_every_name_is_there() -> None:
     for name in ident.__all__:
-        assert getattr(ident, name).__name__ == name
+        if name != "FloatArray":  # an alias, which has no name of its own
+            assert getattr(ident, name).__name__ == name
     assert set(ident.__all__) <= set(dir(ident))
     misspelt = "identfy"
     with pytest.raises(AttributeError, match=r"no attribute 'identfy'; it exports .*identify"):
@@ -149,6 +156,96 @@ def test_lists_are_as_good_as_arrays(example: SimpleNamespace) -> None:
         ident.predict_torque(calibration, model, ident.planned(motion, 100.0)),
         ident.predict_torque(calibration, model, ident.planned(listed, 100.0)),
     )
+
+
+class Frame:
+    """A table as pandas has it: it becomes an array, and is none."""
+
+    def __init__(self, values: FloatArray) -> None:
+        """Store the values."""
+        self._values = values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> FloatArray:
+        """Return the values."""
+        del copy
+        return np.asarray(self._values, dtype=dtype)
+
+
+def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(example: SimpleNamespace) -> None:
+    model = ident.Model(ident.robot_from_urdf(example.URDF), ident.DriveTrain(Frame(np.diag(example.GEAR_RATIOS))))
+    runs = [example.record(model, "bare", None, 1), example.record(model, "loaded", example.DISC, 2)]
+    frames = [
+        ident.Run(
+            run.name,
+            Frame(run.time_s),
+            Frame(run.position_rad),
+            Frame(run.current_a),
+            run.payload,
+            valid=np.ones(run.current_a.shape).tolist(),
+        )
+        for run in runs
+    ]
+    found = ident.identify(model, runs)
+    same = ident.identify(model, frames)
+    assert np.array_equal(found.estimate.gains, same.estimate.gains)
+    assert np.array_equal(found.estimate.gains_std, same.estimate.gains_std)
+    nameplate = Frame(np.array(example.NAMEPLATE_NM_A))
+    fixed = ident.identify(model, frames, fixed_gains=nameplate)
+    assert fixed.estimate.gains.tolist() == list(example.NAMEPLATE_NM_A)
+    axes = ("J1", "J2", "J3")
+    calibration = ident.calibration_of(same, axes, nameplate)
+    assert [gain.nameplate for gain in calibration.gains] == list(example.NAMEPLATE_NM_A)
+    assert ident.diagnose(same, axes, nameplate) == ident.diagnose(found, axes, list(example.NAMEPLATE_NM_A))
+    motion = _slow_motion()
+    framed = ident.Motion(Frame(motion.position_rad), motion.velocity_rad_s.tolist(), motion.acceleration_rad_s2)
+    assert np.array_equal(model.regressor(motion), model.regressor(framed))
+    torque_nm = ident.measured_torque(calibration, model, Frame(runs[0].current_a))
+    assert np.array_equal(torque_nm, ident.measured_torque(calibration, model, runs[0].current_a))
+
+
+def test_the_parameters_that_a_type_checker_sees_are_those_of_the_class() -> None:
+    """Constructors are written twice: for type checkers with whatever becomes an array, at run time by the fields."""
+    for kind in (ident.Run, ident.Motion, ident.DriveTrain):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+        (checked,) = (node for node in functions if node.name == "__init__")
+        names = [argument.arg for argument in checked.args.args]
+        own = inspect.signature(kind).parameters
+        assert names == ["self", *own]
+        defaults = [ast.literal_eval(one) for one in checked.args.defaults]
+        assert defaults == [one.default for one in own.values() if one.default is not one.empty]
+
+
+def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
+    found = example.main()
+    assert found.conditioning == ident.Conditioning()  # 500 Hz
+    runs = [example.record(found.model, "bare", None, 1), example.record(found.model, "loaded", example.DISC, 2)]
+    slow = [
+        replace(run, time_s=run.time_s[::10], position_rad=run.position_rad[::10], current_a=run.current_a[::10])
+        for run in runs
+    ]
+    of_slow = ident.identify(found.model, iter(slow))
+    assert of_slow.conditioning.position_cutoff_hz == pytest.approx(16.0)
+    assert of_slow.conditioning.decimation_cutoff_hz == pytest.approx(8.0)
+    error = np.abs(of_slow.estimate.gains - example.TRUE_GAINS_NM_A)
+    assert np.all(error < 4.0 * of_slow.estimate.gains_std)
+
+
+def test_a_calibration_brings_its_filters(example: SimpleNamespace) -> None:
+    model = example.main().model
+    runs = [example.record(model, "bare", None, 1), example.record(model, "loaded", example.DISC, 2)]
+    given = ident.Conditioning(30.0, decimation_cutoff_hz=15.0)
+    calibration = ident.calibration_of(ident.identify(model, runs, given), ("J1", "J2", "J3"), [1.0, 1.0, 1.0])
+    assert calibration.conditioning == given
+    weighed = ident.weigh(calibration, model, runs[1:])
+    assert weighed.mass_kg == ident.weigh(calibration, model, runs[1:], given).mass_kg
+    assert weighed.mass_kg != ident.weigh(calibration, model, runs[1:], ident.Conditioning()).mass_kg
+    quiet = ident.prediction_band(calibration, model, runs[1:])
+    external = ident.external_torque(calibration, model, runs[1], band=quiet)
+    same = ident.external_torque(calibration, model, runs[1], given, quiet)
+    assert np.array_equal(external.torque_nm, same.torque_nm)
+    with pytest.raises(ident.ModelError, match=r"the filter of the calibration: found nothing; .*give `conditioning`"):
+        ident.weigh(replace(calibration, filter={}), model, runs[1:])
 
 
 def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(example: SimpleNamespace) -> None:

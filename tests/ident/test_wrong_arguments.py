@@ -64,7 +64,20 @@ OF_A_CALL: list[tuple[str, Call, str]] = [
     ("one held out", lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]), "holdout .* give a list"),
     ("no run", lambda m, _: lax.identify(m, [], lax.Conditioning()), "^no run was given; expected one without load"),
     ("arrays", lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()), "type ndarray; expected Run; write"),
-    ("no filters", lambda m, r: lax.identify(m, r, None), "type NoneType; expected Conditioning; write Conditioning"),
+    ("a cut-off", lambda m, r: lax.identify(m, r, 40.0), "type float; expected Conditioning; write Conditioning"),
+    ("one name", lambda m, r: lax.identify(m, [r[0], r[0]]), "'bare': found two runs of this name; expected another"),
+    ("held out, too", lambda m, r: lax.identify(m, r, holdout=[r[1]]), "'loaded': found two runs of this name"),
+    (
+        "milliseconds",
+        lambda m, r: lax.identify(m, [replace(one, time_s=1000.0 * one.time_s) for one in r]),
+        r"'bare': time_s has 4 s between samples; expected seconds, .* divide them by 1000",
+    ),
+    (
+        "a tuple for a closure",
+        lambda *_: lax.robot_from_urdf(THREE_AXES.urdf, closures=[("loop", "a", "b", ("x",))]),
+        r"an entry of closures is of type tuple; expected LinkPair; write LinkPair\(name, first",
+    ),
+    ("no motion", lambda *_: lax.Motion(None, [[0.0]], [[0.0]]), "position_rad of the motion is None; expected an arr"),
     ("no model", lambda m, r: lax.identify(m.robot, r, lax.Conditioning()), "type Robot; expected Model; write"),
     ("cut-off", lambda m, r: lax.identify(m, r, lax.Conditioning(0.0)), "'bare': .*cut-off of 0 Hz; expected above"),
     ("decimation", lambda m, r: lax.identify(m, r, lax.Conditioning(decimation_cutoff_hz=-1)), "of -1 Hz; expected"),
@@ -90,7 +103,11 @@ OF_A_CALL: list[tuple[str, Call, str]] = [
     ("ragged", lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]), "the drive train is no array of numbers.*expected"),
     ("file name", lambda *_: lax.robot_from_urdf("robot.urdf"), r"looks like a file name; .* pass Path\(...\).read_te"),
     ("path", lambda *_: lax.robot_from_urdf(Path("robot.urdf")), "'robot.urdf'.* looks like a file name; expected"),
-    ("plan", lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0), "planned motion.* no array of"),
+    (
+        "plan",
+        lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0),
+        "position_rad of the motion is no array of",
+    ),
 ]
 
 
@@ -106,6 +123,14 @@ def test_an_argument_of_another_kind_is_refused(
         warnings.simplefilter("error")
         with pytest.raises(ident.IdentificationError, match=words):
             call(small_truth.model, list(short))
+
+
+def test_runs_of_different_logs_may_have_one_name(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+    """Sessions in folders of their own give their logs the same names."""
+    bare, loaded = short
+    of_logs = [replace(bare, digest="a" * 64), replace(loaded, name=bare.name, digest="b" * 64)]
+    same = ident.identify(small_truth.model, of_logs)
+    assert np.array_equal(same.estimate.gains, ident.identify(small_truth.model, short).estimate.gains)
 
 
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:

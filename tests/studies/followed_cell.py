@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.workflow.experiment import POSITION_MARGIN, PlannedMove, path_of
+from daq.workflow.experiment import PlannedMove, path_of
 from daq.workflow.plan import DWELL_S
 from drivers.simulation.amplifier import AmplifierSet, ProfileMove, counts_per_rad
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
+from ident.planning.limits import POSITION_MARGIN
 from tests.studies.direct_cell import RawRun
 
 PIECE = 5  #: Samples with one acceleration

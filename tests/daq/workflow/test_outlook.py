@@ -15,7 +15,7 @@ from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.report.plan_preview import preview_page
 from daq.workflow.accepted_room import SLACK_M, AcceptedRoom, accepted_room, extent, placed
-from daq.workflow.experiment import Experiment, JointLimits, experiment_of, paths_of
+from daq.workflow.experiment import Experiment, experiment_of, limits_of, paths_of
 from daq.workflow.outlook import HELP, Outlook, help_with
 from daq.workflow.plan import Plan, TargetBox, load_plan, plan, save_plan
 from ident.planning.clearance import Box
@@ -38,7 +38,7 @@ def experiment() -> Experiment:
 
 def _narrow(experiment: Experiment) -> TargetBox:
     """Two thirds of each range, and less of J4."""
-    lower, upper = JointLimits.of(experiment.cell).targets()
+    lower, upper = limits_of(experiment.cell).targets()
     middle = 0.5 * (lower + upper)
     half = np.full(len(middle), 1.0 / 3.0)
     half[POOR] = 0.1

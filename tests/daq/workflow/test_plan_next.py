@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell_file import load_cell
 from daq.errors import UsageError
-from daq.workflow.experiment import Experiment, JointLimits, experiment_of, paths_of
+from daq.workflow.experiment import Experiment, experiment_of, limits_of, paths_of
 from daq.workflow.plan import Plan, PlanGoal, TargetBox, plan
 from ident.planning.gain_verdict import verdicts
 from ident.planning.target import SlowCause, recorded_information, slow_cause
@@ -59,7 +59,7 @@ def _information(experiment: Experiment, made: Plan) -> FloatArray:
 
 def _box_without(experiment: Experiment, axis: int) -> TargetBox:
     """All room, but one axis rests in the middle of its range."""
-    lower, upper = JointLimits.of(experiment.cell).targets()
+    lower, upper = limits_of(experiment.cell).targets()
     middle = 0.5 * (lower[axis] + upper[axis])
     lower[axis] = middle
     upper[axis] = middle
@@ -157,7 +157,7 @@ def test_the_same_seed_and_record_give_the_same_plan(experiment: Experiment, poo
 @settings(max_examples=6)
 @given(seed=st.integers(0, 1000), middle=st.floats(0.4, 0.6), width=st.floats(0.2, 0.5))
 def test_targets_and_ways_stay_in_the_box(experiment: Experiment, seed: int, middle: float, width: float) -> None:
-    lower, upper = JointLimits.of(experiment.cell).targets()
+    lower, upper = limits_of(experiment.cell).targets()
     span = upper - lower
     box = TargetBox(lower + (middle - 0.5 * width) * span, lower + (middle + 0.5 * width) * span)
     made = _made(experiment, seed, exchanges=24, box=box)
@@ -169,7 +169,7 @@ def test_targets_and_ways_stay_in_the_box(experiment: Experiment, seed: int, mid
 
 
 def test_a_box_outside_the_limits_is_refused(experiment: Experiment) -> None:
-    lower, upper = JointLimits.of(experiment.cell).targets()
+    lower, upper = limits_of(experiment.cell).targets()
     lower[2] = upper[2] + 0.1
     with pytest.raises(UsageError, match="outside the joint limits of J3"):
         _made(experiment, 1, box=TargetBox(lower, upper + 0.2))

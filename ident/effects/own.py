@@ -1,0 +1,184 @@
+"""Effects of one's own: subclasses of `Effect` in other packages, found by an entry point or given as an argument.
+
+A package registers its effects in its `pyproject.toml`::
+
+    [project.entry-points."drivegain.effects"]
+    eccentric-friction = "my_effects:EFFECTS"
+
+where ``EFFECTS`` is an effect, or a sequence of effects: those of one name are one family, with the values of its
+searched parameters that a search tries.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
+from itertools import chain
+
+from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
+from ident.effects.effect import Effect, is_shipped
+from ident.errors import EffectRefused
+
+ENTRY_POINT_GROUP = "drivegain.effects"
+_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+
+Family = tuple[Effect, ...]
+"""Effects of one name, with the values of its searched parameters that a search tries."""
+
+SHIPPED = {effect.name: effect for effect in chain((family[0] for family in (*EFFECTS, *GEOMETRY)), UNNAMED)}
+"""One member of each family of the dictionary, by its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class InstalledFamily:
+    """A family of another package."""
+
+    family: Family
+    package: str  #: name and version of the package
+
+
+def search_families(own_effects: Sequence[Effect] = ()) -> tuple[Family, ...]:
+    """Return the families that a search tries: the dictionary, those of installed packages, and one's own.
+
+    Args:
+        own_effects: given as an argument; they take the place of installed ones of the same name.
+
+    Raises:
+        EffectRefused: an effect of another package cannot be used (`installed_families`, `families_of`).
+    """
+    given = families_of(own_effects, "`own_effects`")
+    names = {family[0].name for family in given}
+    installed = (one.family for name, one in installed_families().items() if name not in names)
+    return (*EFFECTS, *installed, *given)
+
+
+def known_effect(name: str, own_effects: Sequence[Effect] = ()) -> Effect | None:
+    """Return a member of the family of this name; None where there is none.
+
+    Args:
+        name: of the family.
+        own_effects: given as an argument; they come before installed ones of the same name.
+
+    Raises:
+        EffectRefused: an effect of another package cannot be used.
+    """
+    if name in SHIPPED:  # a package that cannot be loaded is no reason not to predict without it
+        return SHIPPED[name]
+    for effect in own_effects:
+        if effect.name == name:
+            return effect
+    installed = installed_families().get(name)
+    return None if installed is None else installed.family[0]
+
+
+def known_names() -> tuple[str, ...]:
+    """Return the names of all families: of the dictionary, then of installed packages."""
+    return (*SHIPPED, *installed_families())
+
+
+@cache  # of one process: a package that is installed later is found by the next one
+def installed_families() -> dict[str, InstalledFamily]:
+    """Return the families that installed packages register by an entry point, by their names.
+
+    Raises:
+        EffectRefused: an entry point cannot be loaded, is no effect, or two packages have effects of one name.
+    """
+    found: dict[str, InstalledFamily] = {}
+    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda one: (one.name, one.value)):
+        package = _package_of_entry(point)
+        where = f"entry point {point.name!r} of package {package!r}"
+        for family in families_of(_loaded(point, where), where):
+            name = family[0].name
+            if name in found:
+                raise EffectRefused(
+                    f"{where}: found effect {name!r}, which package {found[name].package!r} has, too; expected one "
+                    "package for each effect; remove one of the packages"
+                )
+            found[name] = InstalledFamily(family, package)
+    return found
+
+
+def families_of(effects: Iterable[object], where: str) -> tuple[Family, ...]:
+    """Group effects of one's own by name, and check that a search and a calibration can use them.
+
+    Args:
+        effects: in the order in which the search tries them.
+        where: source of the effects, for the error.
+
+    Raises:
+        EffectRefused: one is not an effect, has a name that cannot be used, or a field that no calibration would keep.
+    """
+    families: dict[str, list[Effect]] = {}
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            given = f"the class {effect.__name__}" if isinstance(effect, type) else f"{effect!r:.80}"
+            raise EffectRefused(f"{where}: found {given}; expected objects of subclasses of `ident.Effect`")
+        _check(effect, where)
+        family = families.setdefault(effect.name, [])
+        if family and type(family[0]) is not type(effect):
+            raise EffectRefused(
+                f"{where}: found two classes of effects with the name {effect.name!r}; expected one name for each class"
+            )
+        family.append(effect)
+    return tuple(map(tuple, families.values()))
+
+
+def package_of(effect: Effect) -> str | None:
+    """Return name and version of the package that has an effect; None of one that drivegain ships.
+
+    An effect that no installed package has is named by its module: `module my_effects`.
+    """
+    if is_shipped(effect):
+        return None
+    installed = installed_families().get(effect.name)
+    if installed is not None and type(installed.family[0]) is type(effect):
+        return installed.package
+    module = type(effect).__module__
+    packages = packages_distributions().get(module.partition(".")[0], ())
+    for package in packages:
+        return f"{package} {version(package)}"
+    return f"module {module}"
+
+
+def _package_of_entry(point: EntryPoint) -> str:
+    if point.dist is None:
+        return point.module
+    return f"{point.dist.name} {point.dist.version}"
+
+
+def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
+    """What an entry point names: one effect, or several."""
+    try:
+        loaded = point.load()
+    except Exception as error:  # code of others may fail in any way
+        found = f"{point.value!r} that cannot be loaded ({type(error).__name__}: {error})"
+        raise EffectRefused(f"{where}: found {found}; expected an effect; repair or remove the package") from error
+    return loaded if isinstance(loaded, list | tuple) else (loaded,)
+
+
+def _check(effect: Effect, where: str) -> None:
+    """Refuse an effect that cannot be told from others, or be found again from a calibration."""
+    name = effect.name
+    if not _NAME.fullmatch(name):  # names of parameters begin with it
+        raise EffectRefused(
+            f"{where}: found an effect with the name {name!r}; expected lowercase words joined by hyphens, such as "
+            "'eccentric-friction'"
+        )
+    if name in SHIPPED and not is_shipped(effect):
+        raise EffectRefused(f"{where}: found an effect with the name {name!r}, which drivegain has; give it another")
+    kept = set(effect.settings)
+    lost = [field.name for field in fields(effect) if field.name not in kept]
+    if lost:
+        raise EffectRefused(
+            f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; expected each as "
+            "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
+        )
+    unfit = [column.name for column in effect.coefficients if ":" in column.name or not column.name]
+    if unfit or not effect.coefficients:
+        raise EffectRefused(
+            f"{where}: found coefficients {[column.name for column in effect.coefficients]} of effect {name!r}; "
+            "expected at least one, with a name without a colon"
+        )

@@ -1,0 +1,55 @@
+"""Limits of the joints that a plan keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ident.arrays import FloatArray, as_array
+from ident.errors import ModelError
+
+POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointLimits:
+    """Limits of n joints [rad; m of a prismatic joint], shape (n,) each."""
+
+    lower: FloatArray  #: least positions
+    upper: FloatArray  #: largest positions
+    velocity: FloatArray  #: per second
+    acceleration: FloatArray  #: per second squared
+
+    if TYPE_CHECKING:  # whatever becomes an array
+
+        def __init__(
+            self, lower: ArrayLike, upper: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper", "velocity", "acceleration"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+
+    def targets(self) -> tuple[FloatArray, FloatArray]:
+        """Return the least and the largest targets of a plan, which keep a margin from the limits."""
+        margin = POSITION_MARGIN * (self.upper - self.lower)
+        return self.lower + margin, self.upper - margin
+
+    def require_size(self, count: int) -> None:
+        """Refuse limits that are not those of so many joints.
+
+        Raises:
+            ModelError: a limit has another shape, is no finite number, or leaves no room.
+        """
+        lower = as_array("limits.lower", self.lower, (count,), "one per joint")
+        upper = as_array("limits.upper", self.upper, (count,), "one per joint")
+        if not np.all(lower < upper):
+            found = f"positions from {lower.tolist()} to {upper.tolist()}"
+            raise ModelError(f"limits: found {found}; expected each `lower` below its `upper`")
+        for name in ("velocity", "acceleration"):
+            values = as_array(f"limits.{name}", getattr(self, name), (count,), "one per joint")
+            if not np.all(values > 0.0):
+                raise ModelError(f"limits.{name}: found {values.tolist()}; expected numbers above zero")

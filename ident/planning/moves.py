@@ -1,0 +1,325 @@
+"""Plan moves from limits alone: point to point, for the gains that are known worst (paper §2.3).
+
+Random moves fill the duration. Then they are exchanged one at a time, and what lowers the predicted standard deviation
+of the worst gain stays. The information of a plan is the sum over its moves (`ident.planning.excitation`), so that an
+exchange costs the columns of the two moves that it touches.
+
+Nothing here knows what is in the room: the ways between the targets are the caller's to check.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ident.arrays import FloatArray, as_array, require_kind
+from ident.data.conditioning import Conditioning
+from ident.errors import ModelError, PlanUnfit
+from ident.model.bodies import Payload
+from ident.model.model import Model
+from ident.model.robot import Motion
+from ident.planning.effort import EFFORT_MARGIN, believable_efforts, effort_shares
+from ident.planning.excitation import (
+    Design,
+    Excitation,
+    declared_efforts,
+    nominal_expectation,
+    nominal_payload,
+    rows_between_rests,
+    visible_base,
+)
+from ident.planning.limits import JointLimits
+
+DWELL_S = 0.1  #: Rest at each target [s]: moves are told apart by it
+SLOWEST_SHARE = 0.3  #: Least speed of a random move, as a share of the fastest that its limits allow
+SHORTEST_SHARE = 0.3  #: Least way of a random move, as a share of that to a target anywhere: short moves are more moves
+SHARPNESS = 8.0  #: Order of the norm of all deviations that a plan lowers, nearly the largest
+NEAR_SHARE = 0.15  #: Standard deviation of the step to a near target, as a share of the range
+FEWEST_MOVES = 10  #: σ of a fit is found by leaving out moves
+MAX_TRIES = 100  #: Random moves from one place before its limits count as too narrow
+RUNS: tuple[int | None, ...] = (None, 0)  #: The moves are made without load, and with the payload
+PEAK_SPEED = 15.0 / 8.0  #: Largest speed of a move with least jerk, over its mean speed
+PEAK_ACCELERATION = 10.0 / 3.0**0.5  #: Its largest acceleration, over way / duration²
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedMoves:
+    """Moves from rest to rest in which all joints start and end together, each with the least jerk."""
+
+    target_rad: FloatArray  #: start, then the target of each move, shape (moves + 1, n)
+    move_s: FloatArray  #: duration of each move, shape (moves,)
+    dwell_s: float  #: rest at each target
+    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the payload, as
+    #: predicted from a nominal robot, shape (n,).
+    predicted_std_percent: FloatArray
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the start to the end of the last dwell [s]."""
+        return float(self.move_s.sum() + self.dwell_s * len(self.move_s))
+
+    def motion(self, rate_hz: float) -> tuple[FloatArray, Motion]:
+        """Set-points at a rate: time of each sample, shape (k,), and the motion, shape (k, n) each.
+
+        Args:
+            rate_hz: sampling rate.
+        """
+        time_s = np.arange(0.0, self.duration_s, 1.0 / rate_hz)
+        begin_s = np.concatenate(([0.0], np.cumsum(self.move_s + self.dwell_s)[:-1]))
+        move = np.searchsorted(begin_s, time_s, side="right") - 1
+        way_rad = np.diff(self.target_rad, axis=0)
+        share = np.minimum((time_s - begin_s[move]) / self.move_s[move], 1.0)
+        return time_s, _least_jerk(self.target_rad[move], way_rad[move], self.move_s[move], share)
+
+
+def _least_jerk(start_rad: FloatArray, way_rad: FloatArray, move_s: FloatArray, share: FloatArray) -> Motion:
+    """q = q₀ + d (10 s³ − 15 s⁴ + 6 s⁵), s = t/T: Flash & Hogan, J. Neurosci. 5 (1985); shapes (k, n) and (k,)."""
+    s = share[:, None]
+    duration_s = move_s[:, None]
+    position = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
+    speed = 30.0 * s**2 - 60.0 * s**3 + 30.0 * s**4
+    acceleration = 60.0 * s - 180.0 * s**2 + 120.0 * s**3
+    return Motion(start_rad + way_rad * position, way_rad * speed / duration_s, way_rad * acceleration / duration_s**2)
+
+
+class _Exchange(Enum):
+    """What is changed in a try."""
+
+    ANYWHERE = 0
+    NEAR = 1
+    SPEED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Draft:
+    """Targets and durations of moves while they are exchanged, with what each of them tells."""
+
+    target_rad: tuple[FloatArray, ...]  #: start, then the target of each move
+    share: tuple[float, ...]  #: of the fastest speed, of each move
+    move_s: tuple[float, ...]  #: duration of each move
+    information: tuple[FloatArray, ...]  #: of each move, shape (p, p)
+
+    @property
+    def duration_s(self) -> float:
+        """Time with all dwells [s]."""
+        return sum(self.move_s) + DWELL_S * len(self.move_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """What moves are judged by."""
+
+    design: Design
+    limits: JointLimits
+    effort: FloatArray  #: limit of each axis [Nm or N], inf where it is not known, shape (n,)
+    row_s: float  #: time between two rows of the fit [s]
+    edge_s: float  #: how long after a rest rows begin to count [s]
+
+    def fastest_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
+        """Shortest duration of a move within the limits of velocity and acceleration [s]."""
+        way_rad = np.abs(end_rad - start_rad)
+        by_velocity = PEAK_SPEED * way_rad / self.limits.velocity
+        by_acceleration = np.sqrt(PEAK_ACCELERATION * way_rad / self.limits.acceleration)
+        return float(max(by_velocity.max(), by_acceleration.max()))
+
+    def information(self, start_rad: FloatArray, end_rad: FloatArray, move_s: float) -> FloatArray | None:
+        """Information of a move, without load and with the payload; None where a drive would not have the torque."""
+        time_s = np.arange(0.5 * self.row_s, move_s, self.row_s)
+        if len(time_s) == 0:
+            return None
+        each = (len(time_s), 1)
+        motion = _least_jerk(
+            np.tile(start_rad, each), np.tile(end_rad - start_rad, each), np.full(len(time_s), move_s), time_s / move_s
+        )
+        expected = self.design.expectation
+        if np.isfinite(self.effort).any():
+            shares = effort_shares(expected, self.effort, motion, RUNS)
+            if shares.max() * EFFORT_MARGIN > 1.0:
+                return None
+        # Rows whose filter window has a rest in it do not count (`ident.equations.rows`).
+        is_moving = (time_s > self.edge_s) & (time_s < move_s - self.edge_s)
+        moved = np.abs(end_rad - start_rad) > 0.0
+        train = expected.model.drive_train
+        needed = (train.to_motor != 0.0) | (train.direction != 0.0)
+        motor_moves = np.array([moved[row].all() for row in needed])
+        use = motor_moves[:, None] & is_moving
+        return self.design.information(Excitation(motion, use), RUNS)
+
+    def random_target(self, rng: np.random.Generator, start_rad: FloatArray | None = None) -> FloatArray:
+        """A target within the limits, with a margin, on the way from the start to anywhere; None: anywhere."""
+        lower, upper = self.limits.targets()
+        end_rad = rng.uniform(lower, upper)
+        if start_rad is None:
+            return end_rad
+        return np.asarray(start_rad + rng.uniform(SHORTEST_SHARE, 1.0) * (end_rad - start_rad))
+
+    def near_target(self, rng: np.random.Generator, target_rad: FloatArray) -> FloatArray:
+        """A target near another one, within the limits."""
+        lower, upper = self.limits.targets()
+        step_rad = NEAR_SHARE * (upper - lower) * rng.standard_normal(len(lower))
+        return np.clip(target_rad + step_rad, lower, upper)
+
+    def cost(self, information: FloatArray) -> float:
+        """Nearly the largest predicted deviation [%]; inf where a gain does not show."""
+        std_percent = self.design.std_percent(information)
+        return float(np.linalg.norm(std_percent, SHARPNESS)) if np.isfinite(std_percent).all() else np.inf
+
+
+def plan_moves(
+    model: Model,
+    limits: JointLimits,
+    payload: Payload,
+    nameplate: ArrayLike,
+    *,
+    urdf: str | None = None,
+    duration_s: float = 40.0,
+    seed: int = 0,
+    exchanges: int = 1000,
+    conditioning: Conditioning | None = None,
+) -> PlannedMoves:
+    """Choose moves that let the worst gain be known as well as the time allows, from limits and without a cell file.
+
+    The moves are made twice: without load, and with the payload. Positions, velocities and accelerations keep the
+    limits on the whole way, targets with a margin; torques keep the efforts of the URDF, where it has any. Obstacles
+    and the arm itself are not known: look at the moves before a robot makes them.
+
+    Args:
+        model: the declared model of a serial robot.
+        limits: of the joints.
+        payload: that will be mounted, with its known mass.
+        nameplate: gains by the data sheet, shape (n,); their sizes decide how clearly a torque shows.
+        urdf: text of the URDF with inertias and efforts; without it, links are rods of 5 kg.
+        duration_s: of one run [s], dwells included.
+        seed: the same seed gives the same moves.
+        exchanges: tries; with 0 the random moves are the plan.
+        conditioning: the filters of the fit; the usual ones when None.
+
+    Returns:
+        the moves, with the predicted standard deviation of each gain.
+
+    Raises:
+        ModelError: an argument is of another type or shape, a limit is none, or the robot is a closed chain.
+        PlanUnfit: the duration has no room for enough moves, or some gain does not show in them.
+    """
+    require_kind("model", model, Model, "write Model(robot, drive_train)")
+    require_kind("limits", limits, JointLimits, "write JointLimits(lower, upper, velocity, acceleration)")
+    require_kind("payload", payload, Payload, "write Payload(name, mounting, known)")
+    if model.robot.closures:
+        raise ModelError("the model is of a closed chain, whose reach is not known here; expected a serial robot")
+    count = model.robot.axis_count
+    gains = as_array("nameplate", nameplate, (count,), "one per motor")
+    if not gains.all():
+        raise ModelError(f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing")
+    limits.require_size(count)
+    search = _search_of(model, limits, payload, gains, urdf, conditioning or Conditioning())
+    rng = np.random.default_rng(seed)
+    draft = _improved(search, _random_moves(search, rng, duration_s), rng, duration_s, exchanges)
+    predicted = search.design.std_percent(np.sum(draft.information, axis=0))
+    unseen = [model.robot.axes[axis].name for axis in np.flatnonzero(~np.isfinite(predicted))]
+    if unseen:
+        raise PlanUnfit(
+            found=f"gains that {len(draft.move_s)} moves do not show: {', '.join(unseen)}",
+            expected="moves that show every gain",
+            remedy="allow a longer `duration_s` or wider `limits`, or give a payload with a mass",
+        )
+    return PlannedMoves(np.array(draft.target_rad), np.array(draft.move_s), DWELL_S, predicted)
+
+
+def _search_of(
+    model: Model, limits: JointLimits, payload: Payload, gains: FloatArray, urdf: str | None, conditioning: Conditioning
+) -> _Search:
+    """What moves of a nominal robot are judged by."""
+    fast_motion = _fast_motion(limits)
+    expected = nominal_payload(model.robot, payload)
+    expectation, _ = nominal_expectation(model, urdf, gains, expected, limits, fast_motion)
+    effort = believable_efforts(expectation, declared_efforts(model, urdf), fast_motion.position_rad, RUNS)
+    row_s, edge_s = rows_between_rests(conditioning)
+    return _Search(Design(expectation, visible_base(model, fast_motion)), limits, effort, row_s, edge_s)
+
+
+def _fast_motion(limits: JointLimits) -> Motion:
+    """Random states as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
+    rng = np.random.default_rng(0)
+    shape = (960, len(limits.lower))
+    position = rng.uniform(limits.lower, limits.upper, shape)
+    velocity = limits.velocity * rng.uniform(-1.0, 1.0, shape)
+    acceleration = limits.acceleration * rng.uniform(-1.0, 1.0, shape)
+    return Motion(position, velocity, acceleration)
+
+
+def _move(search: _Search, start_rad: FloatArray, end_rad: FloatArray, share: float) -> tuple[float, FloatArray] | None:
+    """Duration and information of a move; None where it cannot be made."""
+    move_s = search.fastest_s(start_rad, end_rad) / share
+    information = search.information(start_rad, end_rad, move_s)
+    return None if information is None else (move_s, information)
+
+
+def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) -> _Draft:
+    """Fill the duration with random moves."""
+    targets = [search.random_target(rng)]
+    shares: list[float] = []
+    moves_s: list[float] = []
+    found: list[FloatArray] = []
+    tries = 0
+    while tries < MAX_TRIES:
+        tries += 1
+        target = search.random_target(rng, targets[-1])
+        share = float(rng.uniform(SLOWEST_SHARE, 1.0))
+        move = _move(search, targets[-1], target, share)
+        if move is None:
+            continue
+        move_s, information = move
+        if sum(moves_s) + move_s + DWELL_S * (len(moves_s) + 1) > duration_s:
+            break
+        targets.append(target)
+        shares.append(share)
+        moves_s.append(move_s)
+        found.append(information)
+        tries = 0
+    if len(moves_s) < FEWEST_MOVES:
+        raise PlanUnfit(
+            found=f"room for {len(moves_s)} moves in {duration_s:g} s",
+            expected=f"at least {FEWEST_MOVES}, and better 30",
+            remedy="give a longer `duration_s`, higher `limits`, or the right efforts in the URDF",
+        )
+    return _Draft(tuple(targets), tuple(shares), tuple(moves_s), tuple(found))
+
+
+def _improved(search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float, exchanges: int) -> _Draft:
+    """Exchange targets and speeds one at a time, and keep what lowers the deviations."""
+    least = search.cost(np.sum(draft.information, axis=0))
+    for _ in range(exchanges):
+        proposal = _exchanged(search, draft, rng)
+        if proposal is None or proposal.duration_s > duration_s:
+            continue
+        cost = search.cost(np.sum(proposal.information, axis=0))
+        if cost < least:
+            draft = proposal
+            least = cost
+    return draft
+
+
+def _exchanged(search: _Search, draft: _Draft, rng: np.random.Generator) -> _Draft | None:
+    """The same moves with another target, a near one or another speed; None where a move cannot be made."""
+    changed = int(rng.integers(len(draft.target_rad)))
+    kind = _Exchange(int(rng.integers(len(_Exchange))))
+    targets = list(draft.target_rad)
+    shares = list(draft.share)
+    moves_s = list(draft.move_s)
+    information = list(draft.information)
+    touched = [move for move in (changed - 1, changed) if 0 <= move < len(moves_s)]
+    if kind is _Exchange.ANYWHERE:
+        targets[changed] = search.random_target(rng, targets[changed - 1] if changed else None)
+    elif kind is _Exchange.NEAR:
+        targets[changed] = search.near_target(rng, targets[changed])
+    else:
+        shares[touched[0]] = float(rng.uniform(SLOWEST_SHARE, 1.0))
+    for move in touched:
+        found = _move(search, targets[move], targets[move + 1], shares[move])
+        if found is None:
+            return None
+        moves_s[move], information[move] = found
+    return _Draft(tuple(targets), tuple(shares), tuple(moves_s), tuple(information))

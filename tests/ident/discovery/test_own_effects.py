@@ -1,0 +1,93 @@
+"""Effects of one's own in the search: found where they are, not where they are not, and beside mistakes of geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import numpy as np
+import pytest
+
+import ident
+from ident.arrays import FloatArray
+from ident.data.dataset import Dataset
+from ident.discovery import geometry_check
+from ident.discovery.candidates import FamilyTrials
+from ident.discovery.evidence import Evidence
+from ident.discovery.gates import Gates
+from ident.discovery.loop import find_effects
+from ident.discovery.search import rank_families
+from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record
+
+GATES = Gates(draws=199)
+COSINE_NM = 9.0
+SINE_NM = -6.0
+LOBES = 2.7
+
+
+@dataclass(frozen=True, slots=True)
+class LobedFriction(ident.Effect):
+    """τ = sign(q̇) · (a cos ηq + b sin ηq)."""
+
+    name = "lobed-friction"
+    declares = ident.Property.ODD_IN_VELOCITY
+    abscissa = ident.Abscissa.POSITION
+    coefficients = (ident.Column("cosine", "Nm"), ident.Column("sine", "Nm"))
+    needs_revolute = True
+
+    lobes: Annotated[float, ident.Range(1.5, 12.0)]  #: η
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k)."""
+        angle_rad = self.lobes * signals.position_rad[axis]
+        direction = np.sign(signals.velocity_rad_s[axis])
+        return np.asarray(np.stack((np.cos(angle_rad), np.sin(angle_rad))) * direction)
+
+
+OWN = tuple(LobedFriction(lobes) for lobes in (2.0, 3.0, 4.0))
+
+
+def _lobed(data: Dataset) -> FloatArray:
+    position_rad = data.position_rad[:, 1]
+    size_nm = COSINE_NM * np.cos(LOBES * position_rad) + SINE_NM * np.sin(LOBES * position_rad)
+    return acting_on(1, 3, size_nm * np.sign(data.velocity_rad_s[:, 1]))
+
+
+def test_it_is_found_where_it_is_and_its_setting_is_refined(small: Evidence, small_truth: Truth) -> None:
+    steps = find_effects(bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=OWN)
+    (placed,) = steps[-1].after.effects
+    assert isinstance(placed.effect, LobedFriction)
+    assert placed.axis == 1
+    assert placed.effect.lobes == pytest.approx(LOBES, abs=0.1)  # it was among none of those given
+    estimate = steps[-1].after.estimate
+    values = dict(zip((column.name for column in estimate.unknowns), estimate.parameters, strict=True))
+    found = [values[column.name] for column in placed.columns]
+    assert found == pytest.approx([COSINE_NM, SINE_NM], abs=1.0)
+
+
+def test_it_is_not_found_where_it_is_not(small: Evidence) -> None:
+    steps = find_effects(small, np.random.default_rng(0), GATES, own_effects=OWN)
+    assert steps[-1].after.effects == ()
+    assert "lobed-friction" in {finding.effect.name for finding in steps[0].findings}
+
+
+def test_mistakes_of_the_description_compete_with_it(small_truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A zero that is off by 2° is a suspect, which must stand beside every other effect."""
+    rng = np.random.default_rng(5)
+    runs: list[ident.Run] = []
+    for number in range(4):
+        run = record(small_truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.03)
+        runs.append(replace(run, position_rad=run.position_rad + np.radians([0.0, 2.0, 0.0])))
+    mistaken = gathered(small_truth, tuple(runs))
+    tested: set[str] = set()
+
+    def watched(problem: Any, trials: Sequence[FamilyTrials], *rest: Any) -> Any:
+        for one in trials:
+            tested.update(effect.name for effect, _ in one.members)
+        return rank_families(problem, trials, *rest)
+
+    monkeypatch.setattr(geometry_check, "rank_families", watched)
+    (found,) = geometry_check.check_geometry(mistaken, np.random.default_rng(0), GATES, OWN).mistakes
+    assert (found.effect.name, found.axis) == ("zero-offset", 1)
+    assert {"lobed-friction", "zero-offset", "spring"} <= tested

@@ -1,0 +1,232 @@
+"""Effects of one's own: what is accepted as one, and how installed packages are found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, cast
+
+import numpy as np
+import pytest
+
+import ident
+from ident.arrays import FloatArray
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import columns_at
+from ident.effects.own import families_of, installed_families, known_effect, package_of, search_families
+from ident.effects.signals import Signals
+
+SAMPLES = 5
+AXES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SquareDrag(ident.Effect):
+    """τ = c q̇ |q̇|^η."""
+
+    name = "square-drag"
+    declares = ident.Property.ODD_IN_VELOCITY
+    abscissa = ident.Abscissa.VELOCITY
+    coefficients = (ident.Column("drag", "Nm/(rad/s)^2", least=0.0),)
+
+    exponent: Annotated[float, ident.Range(0.5, 3.0)] = 1.0
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        velocity_rad_s = signals.velocity_rad_s[axis]
+        return np.asarray(velocity_rad_s * np.abs(velocity_rad_s) ** self.exponent)[None]
+
+
+@dataclass(frozen=True, slots=True)
+class Named(SquareDrag):
+    """The same with another name."""
+
+    name = "Square Drag"
+
+
+@dataclass(frozen=True, slots=True)
+class Spring(SquareDrag):
+    """The same with a name of the dictionary."""
+
+    name = "spring"
+
+
+@dataclass(frozen=True, slots=True)
+class SecondDrag(SquareDrag):
+    """Another class with the same name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unranged(SquareDrag):
+    """A field that no calibration would keep."""
+
+    name = "unranged-drag"
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Colon(SquareDrag):
+    """A coefficient that would be taken for one of a payload."""
+
+    name = "colon-drag"
+    coefficients = (ident.Column("drag:disc", "Nm"),)
+
+
+@pytest.mark.parametrize(
+    ("effects", "words"),
+    [
+        ([SquareDrag], r"the class SquareDrag; expected objects of subclasses of `ident.Effect`"),
+        (["spring"], r"'spring'; expected objects"),
+        ([Named()], r"the name 'Square Drag'; expected lowercase words joined by hyphens"),
+        ([Spring()], r"the name 'spring', which drivegain has; give it another"),
+        ([SquareDrag(), SecondDrag()], r"two classes of effects with the name 'square-drag'"),
+        ([Unranged()], r"fields of effect 'unranged-drag' without a range: scale; expected each as `Annotated"),
+        ([Colon()], r"coefficients \['drag:disc'\] of effect 'colon-drag'; expected at least one, with a name"),
+    ],
+)
+def test_what_is_no_usable_effect_is_refused(effects: list[object], words: str) -> None:
+    with pytest.raises(ident.EffectRefused, match=rf"^`own_effects`: found .*{words}"):
+        families_of(effects, "`own_effects`")
+
+
+def test_effects_of_one_name_are_one_family() -> None:
+    drags = (SquareDrag(1.0), SquareDrag(2.0))
+    assert families_of(drags, "here") == (drags,)
+    assert search_families(drags) == (*EFFECTS, drags)
+    assert search_families() == EFFECTS
+
+
+def test_an_effect_of_no_package_is_named_by_its_module() -> None:
+    assert package_of(SquareDrag()) == f"module {__name__}"
+    assert package_of(EFFECTS[0][0]) is None
+
+
+@dataclass(frozen=True, slots=True)
+class Given(SquareDrag):
+    """Columns that a test gives."""
+
+    name = "given"
+    given: Annotated[int, ident.Range(0, 2)] = 0
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Columns of another shape, with a number that is not finite, or right ones."""
+        del signals, axis
+        if self.given == 0:
+            return np.zeros(SAMPLES)
+        if self.given == 1:
+            return np.array([[0.0, 1.0, np.nan, 0.0, 0.0]])
+        return cast(FloatArray, [[1] * SAMPLES])
+
+
+def test_columns_of_an_effect_of_ones_own_are_checked() -> None:
+    stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
+    signals = cast(Signals, stub)
+    with pytest.raises(ident.EffectRefused, match=r"'given': found columns of shape \(5,\); expected \(1, 5\)"):
+        columns_at(Given(given=0), signals, 0)
+    with pytest.raises(ident.EffectRefused, match=r"'given': found columns with numbers that are not finite"):
+        columns_at(Given(given=1), signals, 0)
+    assert np.array_equal(columns_at(Given(given=2), signals, 0), np.ones((1, SAMPLES)))
+
+
+class Site:
+    """A folder on the path, into which packages with entry points are written."""
+
+    def __init__(self, folder: Path) -> None:
+        """Store the folder."""
+        self.folder = folder
+
+    def install(self, package: str, code: str, effects: str = "EFFECTS") -> None:
+        """Write module and metadata of a package."""
+        module = package.replace("-", "_")
+        (self.folder / f"{module}.py").write_text(code, encoding="utf-8")
+        metadata = self.folder / f"{module}-0.3.dist-info"
+        metadata.mkdir()
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.3\n", encoding="utf-8")
+        (metadata / "entry_points.txt").write_text(
+            f"[drivegain.effects]\ndrag = {module}:{effects}\n", encoding="utf-8"
+        )
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.syspath_prepend(tmp_path)
+    installed_families.cache_clear()
+    yield Site(tmp_path)
+    installed_families.cache_clear()
+
+
+def _code(package: str) -> str:
+    """A module with the drag, as a class of its own."""
+    return (
+        f"from {SquareDrag.__module__} import SquareDrag\n\n"
+        f"class Drag(SquareDrag):\n    '''Of {package}.'''\n\n"
+        "EFFECTS = [Drag(1.0), Drag(2.0)]\nONE = Drag()\n"
+    )
+
+
+def test_an_installed_package_is_searched_and_named(site: Site) -> None:
+    site.install("drag-one", _code("drag-one"))
+    *shipped, family = search_families()
+    assert tuple(shipped) == EFFECTS
+    assert [effect.settings for effect in family] == [{"exponent": 1.0}, {"exponent": 2.0}]
+    assert package_of(family[0]) == "drag-one 0.3"
+    assert type(known_effect("square-drag")) is type(family[0])
+
+
+def test_an_entry_point_may_name_one_effect(site: Site) -> None:
+    site.install("drag-single", _code("drag-single"), "ONE")
+    (family,) = search_families()[len(EFFECTS) :]
+    assert len(family) == 1
+
+
+def test_an_argument_takes_the_place_of_an_installed_effect(site: Site) -> None:
+    site.install("drag-argued", _code("drag-argued"))
+    own = SquareDrag(1.5)
+    assert search_families((own,)) == (*EFFECTS, (own,))
+    assert known_effect("square-drag", (own,)) is own
+    assert package_of(own) == f"module {__name__}"
+
+
+def test_two_packages_with_one_effect_are_refused(site: Site) -> None:
+    site.install("drag-first", _code("drag-first"))
+    site.install("drag-second", _code("drag-second"))
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"package 'drag-second 0.3': found effect 'square-drag', which package 'drag-first 0.3' has, too",
+    ):
+        search_families()
+
+
+@pytest.mark.parametrize(
+    ("package", "code", "words"),
+    [
+        ("drag-alone", "import nothing_of_this_name", r"cannot be loaded \(ModuleNotFoundError: No module named"),
+        ("drag-raising", "raise KeyError('x')", r"cannot be loaded \(KeyError: 'x'\)"),
+        ("drag-empty", "WRONG = 1", r"cannot be loaded \(AttributeError: module 'drag_empty' has no attribute"),
+        ("drag-number", "EFFECTS = 3", r"found 3; expected objects of subclasses of `ident.Effect`"),
+    ],
+)
+def test_a_broken_package_stops_a_search_and_no_prediction(site: Site, package: str, code: str, words: str) -> None:
+    site.install(package, code)
+    with pytest.raises(ident.EffectRefused, match=rf"^entry point 'drag' of package '{package} 0.3': .*{words}"):
+        search_families()
+    spring = known_effect("spring")
+    assert spring is not None
+    assert spring.name == "spring"
+    with pytest.raises(ident.EffectRefused, match=package):
+        known_effect("square-drag")
+
+
+def test_a_package_that_is_not_there_is_named() -> None:
+    error = ident.EffectNotInstalled("square-drag", "J2", "drag-one 0.3")
+    assert (error.effect, error.axis, error.package) == ("square-drag", "J2", "drag-one 0.3")
+    assert "install this package" in str(error)
+    assert "own_effects" in str(ident.EffectNotInstalled("square-drag", "J2", "module drags"))
+
+
+def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
+    effect = SquareDrag(2.0)
+    assert effect.settings == {"exponent": 2.0}
+    assert effect.with_settings({"exponent": 0.7}) == replace(effect, exponent=0.7)
