@@ -30,6 +30,7 @@ from daq.report import (
     full_parameters,
     gains,
     history,
+    mjcf_views,
     paper_tables,
     proposal,
     residual,
@@ -211,11 +212,39 @@ def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     parameters = SimpleNamespace(
         torque_change_percent=ERROR,
         exact=True,
-        model=SimpleNamespace(robot=SimpleNamespace(joints=()), drive_train=SimpleNamespace(coupled=())),
+        model=SimpleNamespace(robot=SimpleNamespace(joints=(), closures=()), drive_train=SimpleNamespace(coupled=())),
     )
     robot: Any = SimpleNamespace(parameters=parameters, prior=SimpleNamespace(assumed=()))
     updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
     return urdf_views.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
+
+
+def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    joint = SimpleNamespace(
+        mass_kg=123.456,
+        centre_m=(-1.2345, 2.3456, -3.4567),
+        armature=1.23e-5,
+        damping=4.56e-5,
+        friction=1234.5,
+    )
+    left = SimpleNamespace(name="off12", value=-1.234e-5, unit="Nm")
+    report: Any = SimpleNamespace(
+        joints=[SimpleNamespace(name=axis, **vars(joint)) for axis in AXES],
+        actuators=[
+            SimpleNamespace(axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A") for one in GAINS
+        ],
+        torque_change_percent=ERROR,
+        exact=False,
+        parameters=[SimpleNamespace(name="Ixx12", basis="prior")],
+        chosen_by="bodies nearest to the URDF",
+        assumed_links=[],
+        not_in_mjcf=[left],
+        effects_left_out=[],
+        mountings_left_out=[],
+        closures_left_out=[],
+        same_configuration=True,
+    )
+    return mjcf_views.mjcf_view(report)
 
 
 def _full(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -265,6 +294,7 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],
     "history.calibration_table": lambda _cell, known: [history.calibration_table(*known)],
     "history.history_gain_table": lambda _cell, known: [history.history_gain_table(known[1])],
+    "mjcf_views.mjcf_view": _mjcf,
     "paper_tables.view": _paper,
     "proposal.change_table": _changes,
     "residual.turns_view": _turns,
