@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
@@ -62,13 +63,19 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     first = JOINT_COLUMNS * model.robot.joint_count
     motors = np.zeros((model.robot.axis_count, 3))
     motors[coupled] = standard[first : first + 3 * len(coupled)].reshape(-1, 3)
-    squares = model.drive_train.direction**2
+    directions = model.drive_train.direction
+    squares = directions**2
+    for place, of_joints in enumerate((model.rotor_columns, model.viscous_friction_columns)):
+        own = motors[:, place]
+        if np.any(own < 0.0) or np.any(own @ squares > standard[of_joints]):
+            motors[coupled, place] = _least_of_motors(own[coupled], directions[coupled])
     dry = standard[model.dry_friction_columns]
     inertia = _split(standard[model.rotor_columns], motors[:, 0], squares)
     damping = _split(standard[model.viscous_friction_columns], motors[:, 1], squares)
     dry_friction = Terms(np.maximum(dry, 0.0), np.maximum(motors[:, 2], 0.0))
     held = standard.copy()
     held[model.link_columns] = 0.0
+    held[first : first + 3 * len(coupled)] = motors[coupled].ravel()
     missing = held - _standard_of(model, inertia, damping, dry_friction)
     missing[model.link_columns] = 0.0
     left_over = []
@@ -77,6 +84,23 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
         if abs(value) > ROUNDING * abs(whole) and not column.name.endswith(LOADED):
             left_over.append(LeftOver(column.name, float(value), column.unit))
     return DriveTerms(inertia, damping, dry_friction, tuple(left_over))
+
+
+def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
+    """The least Iam or fvm that couple the joints alike, none of them negative where that is possible, shape (c,).
+
+    Both motors of a differential couple its joints with opposite signs: the torque shows their difference, and what
+    both have in common would only need room at the joints.
+
+    Args:
+        of_motors: Iam or fvm of the motors that turn with several joints, shape (c,).
+        directions: r of each of them, shape (c, m).
+    """
+    first, second = np.triu_indices(directions.shape[1], 1)
+    couplings = (directions[:, first] * directions[:, second]).T
+    wanted = couplings @ of_motors
+    least, left = nnls(couplings, wanted)
+    return np.asarray(least if left <= ROUNDING * np.linalg.norm(wanted) else of_motors)
 
 
 def _split(of_joints: FloatArray, of_motors: FloatArray, squares: FloatArray) -> Terms:

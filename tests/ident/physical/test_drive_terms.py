@@ -78,6 +78,20 @@ def test_possible_rotors_leave_nothing_over() -> None:
     assert terms.inertia.of_motors == pytest.approx([0.0] * 4 + [0.7] * 3)
 
 
+@pytest.mark.parametrize(("both", "difference"), [(3.0, 0.2), (3.0, -0.2), (0.0, -0.2)])
+def test_what_both_motors_of_a_differential_have_in_common_is_not_seen_and_leaves_nothing_over(
+    both: float, difference: float
+) -> None:
+    """Their couplings are 1 and −0.5: Iam6 = x and Iam7 = 2 x make no torque, and a solver may choose any x."""
+    values = {f"Ia{axis}": 1.0 for axis in range(1, 8)}
+    values |= {"Iam6": both + difference, "Iam7": 2.0 * both}
+    terms = drive_terms(MODEL, _standard(values))
+    assert terms.left_over == ()
+    seen = {f"Ia{axis}": 1.0 for axis in range(1, 8)} | {"Iam6": difference}
+    expected = np.einsum("jck,c->jk", MODEL.regressor(STATES), _standard(seen))
+    assert _torque(terms, STATES) == pytest.approx(expected, abs=1e-9)
+
+
 def test_what_a_payload_adds_to_friction_is_no_part_of_the_robot() -> None:
     model = replace(MODEL, friction_by_payload=True)
     standard = _standard({"fs1": 2.0, "fs1_loaded": 0.4, "off2": 0.3}, model)
