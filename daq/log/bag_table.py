@@ -2,7 +2,7 @@
 
 A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
 stamp that hold different joints make one row, because several publishers may share a topic. Several that publish the
-same joints are told apart by frame, joints and fields, and one of them is chosen.
+same joints differ in frame, joints or fields, and the import description chooses one of them.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ class _Rows:
             del self._begun[stamp_ns]
 
     def _require_one_publisher(self) -> None:
-        """Refuse joints that several nodes publish, and fields that nobody does.
+        """Refuse joints that several nodes publish, and fields that no node publishes.
 
         Raises:
             TableUnfit: several publish the same joints, the chosen one is not there, or a field has no values.

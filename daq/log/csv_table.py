@@ -16,6 +16,7 @@ from daq.errors import TableUnfit
 from daq.files import sha256
 from daq.log.csv_lines import MISSING, CsvLines, read_lines
 from daq.log.table import (
+    ABSOLUTE_S,
     MIDNIGHT,
     Stamps,
     Table,
@@ -32,7 +33,6 @@ from daq.log.table import (
 )
 from ident.arrays import FloatArray
 
-ABSOLUTE_S = 1e8  #: Stamps above this are since 1970, and floats are too coarse for them: 0.2 µs
 DAY_NS = 86_400 * 10**9
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 _CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9})\d*)?")
@@ -271,6 +271,11 @@ def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) 
         return (
             "the header is there once more: import what is before it by "
             f"`keep: {{to_row: {before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
+        )
+    if row == 0 and set(file.names).intersection(file.fields(file.rows[row])):
+        return (
+            "this is a second header, with the names in another order or with other names: nothing says which of the "
+            "two is right; delete the wrong one from the file"
         )
     if row == 0 and text.lower() not in MISSING and not any(np.isfinite(values[0])):
         return (

@@ -18,6 +18,7 @@ from daq.config.import_description import Column, ImportDescription, KeptPart, S
 from daq.errors import TableUnfit, counted, reason_of
 from ident.arrays import FloatArray
 
+ABSOLUTE_S = 1e8  #: Stamps above this are since 1970, and floats are too coarse for them: 0.2 µs
 TIME_MARGIN_S = 1e-9  #: Stamps so near to an end of the part that is kept are in it
 ROW_MARGIN = 1e-6  #: Likewise, in rows
 COUNTER_BITS = (16, 32)  #: Of counters of time
@@ -67,10 +68,11 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
         other: with `stamps_beside`, or without.
 
     Returns:
-        a remark where one of them begins later.
+        a remark where one of them begins later, by a clock of its own.
 
     Raises:
-        TableUnfit: the steps differ: a row is missing in one of them.
+        TableUnfit: the steps differ, so that a row is missing in one of them, or dates say that they are of other
+            times.
     """
     mine = timed.stamps
     others = other.stamps_beside
@@ -90,6 +92,13 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
     if abs(later_s) <= half_step_s:
         return ()
     name = other.path.name
+    if 1e-9 * min(mine.first_ns, others.first_ns) > ABSOLUTE_S:
+        raise TableUnfit(
+            str(other.path),
+            found=f"stamps that begin {later_s:.6g} s after those of {timed.path.name}, by the same clock",
+            expected="rows of the same instants in both files",
+            remedy="the files are of different times: export the same part of each, or keep it by `keep`",
+        )
     return (f"{name}: its stamps begin {later_s:.6g} s after those of {timed.path.name}: rows count as simultaneous",)
 
 

@@ -180,6 +180,8 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     change = report.torque_change_percent.total
     if report.exact:
         yield "The torque of these bodies is exactly the identified one."
+    elif change is None:
+        yield "The calibration has no torque: all its parameters are zero."
     else:
         yield f"The torque of these bodies differs from the identified one by {change:.2g} %."
     by_prior = [parameter.name for parameter in report.parameters if parameter.basis == RestsOn.PRIOR.value]

@@ -38,6 +38,7 @@ TIME_STEP_S = 0.001
 CLOSED_SHARE = 1e-6
 """Change of a distance from position to position, as a share of the robot's size, below which it is constant."""
 HINGE_SHARE = 0.1  #: Distance of the two points that hold a hinge of a loop, as a share of the robot's size
+WORLD = "world"  #: Name of MuJoCo's own body, which no other one may have
 THINNEST_M = 1e-3  #: Shorter links are not drawn
 _LENGTHS = frozenset({"x", "y", "z"})
 _TURNS = {"rx": 0, "ry": 1, "rz": 2}
@@ -181,12 +182,16 @@ def joint_drive(source: MjcfSource, terms: DriveTerms, index: int) -> dict[str, 
 
 
 def _body_names(source: MjcfSource) -> list[str]:
-    """Name of the URDF's link that each joint moves: of links with its frame, the first from the base."""
+    """Name of the URDF's link that each joint moves: of links with its frame, the first from the base.
+
+    A link with the name of MuJoCo's own body gets another one, and a site keeps its name.
+    """
     named: dict[int, str] = {}
     for name, place in source.frames.items():
         if place.joint >= 0 and _is_joint_frame(place):
             named.setdefault(place.joint, name)
-    return [named.get(index, joint.name) for index, joint in enumerate(source.model.robot.joints)]
+    names = [named.get(index, joint.name) for index, joint in enumerate(source.model.robot.joints)]
+    return [f"{name} link" if name == WORLD else name for name in names]
 
 
 def _is_joint_frame(place: Place) -> bool:

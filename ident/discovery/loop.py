@@ -243,7 +243,7 @@ def _searched(
 
 
 def _ignore(_line: str) -> None:
-    """Take a line of progress that nobody reads."""
+    """Take a line of progress where none is wanted."""
 
 
 def _named_mistakes(

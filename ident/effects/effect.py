@@ -334,12 +334,10 @@ def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
     """Columns of an effect where it is placed; on a joint without a motor, as torques of all axes, (m, p, k).
 
     Raises:
-        EffectRefused: an effect of one's own returns columns of another shape, or a number that is not finite.
+        EffectRefused: an effect of one's own fails, or returns columns of another shape or a number that is not finite.
     """
-    columns = effect.columns(signals, axis)
     count = len(signals.current_a)
-    if not is_shipped(effect):
-        columns = _checked_columns(effect, columns, signals, count)
+    columns = effect.columns(signals, axis) if is_shipped(effect) else _own_columns(effect, signals, axis, count)
     if axis < count:
         return columns
     return np.asarray(signals.leverage[axis - count][:, None] * columns)
@@ -349,9 +347,15 @@ _SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
 """Shape of an effect's columns before (p, k), by where the torque acts; (m,) elsewhere."""
 
 
-def _checked_columns(effect: Effect, columns: object, signals: Signals, count: int) -> FloatArray:
-    """Columns of an effect of one's own as numbers; refused where their shape is wrong or one is not finite."""
-    found = np.asarray(columns, dtype=np.float64)
+def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> FloatArray:
+    """Columns of an effect of one's own; refused where it fails, their shape is wrong or a number is not finite."""
+    try:
+        found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
+    except (Exception, SystemExit) as error:  # code of others: it may fail in any way, and even end the program
+        raise EffectRefused(
+            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `columns`; expected a torque "
+            "for every sample; correct it, and copy what it changes: the arrays of `signals` are read-only"
+        ) from error
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:

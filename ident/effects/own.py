@@ -153,14 +153,14 @@ def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
     """What an entry point names: one effect, or several."""
     try:
         loaded = point.load()
-    except Exception as error:  # code of others may fail in any way
+    except (Exception, SystemExit) as error:  # code of others: it may fail in any way, and even end the program
         found = f"{point.value!r} that cannot be loaded ({type(error).__name__}: {error})"
         raise EffectRefused(f"{where}: found {found}; expected an effect; repair or remove the package") from error
     return loaded if isinstance(loaded, list | tuple) else (loaded,)
 
 
 def _check(effect: Effect, where: str) -> None:
-    """Refuse an effect that cannot be told from others, or be found again from a calibration."""
+    """Refuse an effect that has the name of another, or that a calibration could not name again."""
     name = effect.name
     if not _NAME.fullmatch(name):  # names of parameters begin with it
         raise EffectRefused(

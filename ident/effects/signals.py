@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -113,7 +113,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """One run as an effect sees it; arrays are axis-first, shape (n, k).
+    """One run as an effect sees it; arrays are axis-first, shape (n, k), and cannot be changed.
 
     Torques and currents are the model's predictions, never measurements: a measured current in a regressor would put
     its noise on both sides of the equation.
@@ -144,6 +144,15 @@ class Signals:
     arm: Arm | None = None
     #: Inertia of each axis' rotor that load and mass matrix contain, as far as it is known; empty without any.
     rotor_inertia_kg_m2: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        # Every effect of a search reads the same arrays: one that changed them would change the columns of all others.
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(value, np.ndarray):
+                read_only = value.view()
+                read_only.flags.writeable = False
+                object.__setattr__(self, one.name, read_only)
 
     def temperature(self, axis: int) -> FloatArray:
         """Temperature of an axis [°C], shape (k,); REFERENCE_C where it was not recorded."""

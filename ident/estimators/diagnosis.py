@@ -94,15 +94,12 @@ def diagnose(
         PayloadDiffers: see `payload_diagnoses`.
         JointStill: a joint never moves in a run, in place of an error that this explains.
     """
+    entered_gains: FloatArray | None = None
+    if nameplate is not None:
+        entered_gains = as_array("nameplate", nameplate, (len(axes),), "one per axis")
+    limits = None if effort_limit is None else np.asarray(effort_limit, dtype=np.float64)
     with with_channel_causes(found.channels, axes):
-        return tuple(
-            _diagnoses(
-                found,
-                axes,
-                None if nameplate is None else as_array("nameplate", nameplate, (len(axes),), "one per axis"),
-                None if effort_limit is None else np.asarray(effort_limit, dtype=np.float64),
-            )
-        )
+        return tuple(_diagnoses(found, axes, entered_gains, limits))
 
 
 TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}

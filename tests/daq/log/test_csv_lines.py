@@ -218,6 +218,13 @@ def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(tm
         np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, READ)
 
 
+def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Path) -> None:
+    """Which of the two is right only the file's owner knows: advice to keep one of them would exchange columns."""
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column .*a second header") as caught:
+        _read(tmp_path, ["t,i,q", "t,q,i", *ROWS])
+    assert "`keep" not in caught.value.remedy
+
+
 @pytest.mark.parametrize(("first", "last"), [(0, 2), (10, 11)])
 def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
     tmp_path: Path, first: int, last: int

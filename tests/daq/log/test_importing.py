@@ -1051,10 +1051,10 @@ def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: 
         np.testing.assert_allclose(run.current_a, whole.current_a[is_fit == part], atol=1e-6)
 
 
-def _file_of_each_axis(bench: Bench, later_s: float = 0.0) -> None:
+def _file_of_each_axis(bench: Bench, later_s: float = 0.0, began_s: float = 0.0) -> None:
     """A trace of each axis, with stamps of its own, as the tool of a drive exports them."""
     for axis in range(6):
-        stamps = 0.004 * np.arange(300) + (later_s if axis == 2 else 0.0)
+        stamps = began_s + 0.004 * np.arange(300) + (later_s if axis == 2 else 0.0)
         columns = np.column_stack((stamps, bench.joint_deg[:, axis], bench.current_a[:, axis]))
         lines = ["t,position,current", *(",".join(map(repr, row)) for row in columns.tolist())]
         (bench.data / f"axis{axis + 1}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -1086,6 +1086,14 @@ def test_an_error_names_the_file_of_its_axis(bench: Bench, capsys: pytest.Captur
     lines[41] = ",".join((good.split(",")[0], "5000.0", "0.1"))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     _refused(bench, capsys, 4, "import description 'run', axis J4")
+
+
+@pytest.mark.parametrize("later_s", [0.05, 86400.0])
+def test_files_of_axes_whose_dates_differ_are_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], later_s: float
+) -> None:
+    _file_of_each_axis(bench, later_s, began_s=1_772_000_000.0)
+    _refused(bench, capsys, 4, "axis3.csv", f"{later_s:.6g} s after those of axis1.csv", "of different times")
 
 
 def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:

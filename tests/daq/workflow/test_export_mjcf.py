@@ -495,22 +495,35 @@ def test_what_a_payload_adds_to_friction_is_no_part_of_the_model(
     assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
 
 
+def _tx40_of(folder: Path, urdf: str) -> CalibratedRobot:
+    """The TX-40's cell beside another description of the robot."""
+    (folder / "cells").mkdir()
+    (folder / "robots").mkdir()
+    (folder / "robots/tx40.urdf").write_text(urdf)
+    cell = folder / "cells/tx40.yaml"
+    cell.write_text((CHECKOUT / "configs/cells/tx40.yaml").read_text())
+    return calibrated_robot(cell)
+
+
+def test_a_moving_link_called_world_has_another_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The world is MuJoCo's own body; it refuses a second one."""
+    urdf = (CHECKOUT / "configs/robots/tx40.urdf").read_text().replace('"link3"', '"world"')
+    simulated = loaded(export(_tx40_of(tmp_path, urdf), tmp_path, capsys).text)
+    data = mujoco.MjData(simulated)
+    mujoco.mj_kinematics(simulated, data)
+    assert data.site("world").xpos == pytest.approx(data.body("world link").xpos)
+
+
 def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Names are those of the URDF: a program that knows the tool frame finds it."""
-    source = CHECKOUT / "configs"
-    urdf = (source / "robots/tx40.urdf").read_text()
+    urdf = (CHECKOUT / "configs/robots/tx40.urdf").read_text()
     tool = (
         '<link name="tool"/><joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 -0.2 1.1"/>'
         '<parent link="link6"/><child link="tool"/></joint>'
         '<link name="flange"/><joint name="at flange" type="fixed"><parent link="link6"/><child link="flange"/></joint>'
         "</robot>"
     )
-    (tmp_path / "cells").mkdir()
-    (tmp_path / "robots").mkdir()
-    (tmp_path / "robots/tx40.urdf").write_text(urdf.replace("</robot>", tool))
-    cell = tmp_path / "cells/tx40.yaml"
-    cell.write_text((source / "cells/tx40.yaml").read_text())
-    robot = calibrated_robot(cell)
+    robot = _tx40_of(tmp_path, urdf.replace("</robot>", tool))
     simulated = loaded(export(robot, tmp_path, capsys).text)
     data = mujoco.MjData(simulated)
     data.qpos[:] = robot.states.position_rad[3]

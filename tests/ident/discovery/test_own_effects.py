@@ -72,6 +72,27 @@ def test_it_is_not_found_where_it_is_not(small: Evidence) -> None:
     assert "lobed-friction" in {finding.effect.name for finding in steps[0].findings}
 
 
+@dataclass(frozen=True, slots=True)
+class WritingFriction(LobedFriction):
+    """The same, which changes the positions of everybody."""
+
+    name = "writing-friction"
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k)."""
+        angle_rad = signals.position_rad[axis]
+        angle_rad *= self.lobes
+        return np.stack((np.cos(angle_rad), np.sin(angle_rad)))
+
+
+def test_one_that_writes_into_the_signals_is_refused(small: Evidence) -> None:
+    """Every effect reads the same arrays: the search would go on with other positions."""
+    with pytest.raises(
+        ident.EffectRefused, match=r"'writing-friction': found ValueError .*read-only.* copy what it changes"
+    ):
+        find_effects(small, np.random.default_rng(0), GATES, own_effects=[WritingFriction(2.0)])
+
+
 def test_mistakes_of_the_description_compete_with_it(small_truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
     """A zero that is off by 2° is a suspect, which must stand beside every other effect."""
     rng = np.random.default_rng(5)

@@ -130,6 +130,26 @@ def test_columns_of_an_effect_of_ones_own_are_checked() -> None:
     assert np.array_equal(columns_at(Given(given=2), signals, 0), np.ones((1, SAMPLES)))
 
 
+@dataclass(frozen=True, slots=True)
+class Failing(SquareDrag):
+    """One whose method fails."""
+
+    name = "failing"
+
+    error: Annotated[int, ident.Range(0, 1)] = 0
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Fail."""
+        raise (KeyError("no such signal"), SystemExit(0))[self.error]
+
+
+@pytest.mark.parametrize(("error", "words"), [(0, "KeyError .*no such signal"), (1, "SystemExit")])
+def test_an_effect_of_ones_own_that_fails_is_refused_by_name(error: int, words: str) -> None:
+    stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
+    with pytest.raises(ident.EffectRefused, match=rf"effect 'failing': found {words}"):
+        columns_at(Failing(error=error), cast(Signals, stub), 0)
+
+
 class Site:
     """A folder on the path, into which packages with entry points are written."""
 
@@ -205,6 +225,7 @@ def test_two_packages_with_one_effect_are_refused(site: Site) -> None:
         ("drag-alone", "import nothing_of_this_name", r"cannot be loaded \(ModuleNotFoundError: No module named"),
         ("drag-raising", "raise KeyError('x')", r"cannot be loaded \(KeyError: 'x'\)"),
         ("drag-empty", "WRONG = 1", r"cannot be loaded \(AttributeError: module 'drag_empty' has no attribute"),
+        ("drag-exiting", "raise SystemExit(0)", r"cannot be loaded \(SystemExit: 0\)"),
         ("drag-number", "EFFECTS = 3", r"found 3; expected objects of subclasses of `ident.Effect`"),
     ],
 )
