@@ -353,8 +353,8 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
         found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
     except (Exception, SystemExit) as error:  # code of others: it may fail in any way, and even end the program
         raise EffectRefused(
-            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `columns`; expected a torque "
-            "for every sample; correct it, and copy what it changes: the arrays of `signals` are read-only"
+            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `columns`; expected a "
+            "torque for every sample; correct it, and copy what it changes: the arrays of `signals` are read-only"
         ) from error
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
