@@ -210,6 +210,21 @@ def test_a_terminal_stopped_in_motion_holds_nothing_up_and_shows_the_result_late
     assert words.index(b"complete") < words.index(b"Next: drivegain record")
 
 
+def test_a_recording_outlives_its_terminal(
+    cell: Path, plan: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The SSH connection is gone, and SIGHUP was ignored or never came; the result alone is lost."""
+    log = tmp_path / "bare.mcap"
+    terminal = Screen(*pty.openpty())
+    with _start(checkout, terminal, *_recording(cell, plan, log)) as process:
+        os.close(terminal.writing)
+        _until(process, lambda: _is_begun(log))
+        os.close(terminal.reading)
+        assert process.wait(timeout=WAIT_S) == ExitCode.UNEXPECTED
+    _require_whole_log(log, capsys)
+    _require_powerless(cell, capsys)
+
+
 def test_sigint_ends_a_recording_in_a_stopped_terminal(
     cell: Path, plan: Path, terminal: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

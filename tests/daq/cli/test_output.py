@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import pty
 import signal
@@ -33,6 +34,7 @@ from daq.cli.output import (
     is_behind,
     say_losses_as,
     wait_until_shown,
+    write_if_taken,
 )
 from daq.cli.terminal import say, show_steps, status, until_interrupted
 from daq.errors import ExitCode
@@ -217,9 +219,12 @@ def test_journal_story_and_remarks_return_and_keep_their_order_with_results(full
             stepper.step("fourth")
         with status("not for a pipe") as report_step:
             report_step("fifth")
-        shown = _read_on(reading, b"fifth\n").decode().splitlines()
+        # As without any handler: pytest has installed its own.
+        assert logging.lastResort is not None
+        logging.lastResort.handle(logging.makeLogRecord({"msg": "sixth", "levelno": logging.WARNING}))
+        shown = _read_on(reading, b"sixth\n").decode().splitlines()
     assert json.loads(shown[0])["event"] == "first"
-    assert [line.strip() for line in shown[1:]] == ["second", "! third:", "fourth (0 s)", "fifth"]
+    assert [line.strip() for line in shown[1:]] == ["second", "! third:", "fourth (0 s)", "fifth", "sixth"]
 
 
 def test_a_journal_for_programs_says_what_it_lacks_as_an_event(full_pipe: tuple[int, int]) -> None:
@@ -285,6 +290,18 @@ def test_what_runs_until_an_interrupt_waits_for_no_reader(full_pipe: tuple[int, 
         _read_on(reading, b"where the page is\n")
 
 
+def test_the_word_of_an_interrupt_before_anything_runs_does_not_block(
+    full_pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reading, writing = full_pipe
+    with os.fdopen(os.dup(writing), "w", buffering=1) as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        write_if_taken("nobody takes this\n")
+        os.read(reading, 1 << 20)
+        write_if_taken("interrupted\n")
+    assert os.read(reading, 1 << 20) == b"interrupted\n"
+
+
 COMMAND = [sys.executable, "-m", "daq", "explain-emcy", "8611h", "--json"]
 
 
@@ -293,7 +310,7 @@ def test_a_reader_that_comes_late_and_is_slow_gets_the_whole_result(full_pipe: t
     with subprocess.Popen(COMMAND, stdout=writing, stderr=subprocess.PIPE, cwd=checkout) as process:
         assert process.stderr is not None
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(PATIENCE_S + 3.0)
+            process.wait(2 * PATIENCE_S + 4.0)  # both streams have given up remarks
         taken = b""
         while not taken.endswith(b"}\n"):
             piece = os.read(reading, 4096 if taken.endswith(b".") or not taken else 20)
@@ -312,7 +329,7 @@ def test_a_result_that_nobody_takes_ends_with_a_signal(
     with subprocess.Popen(COMMAND, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout) as process:
         assert process.stderr is not None
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(PATIENCE_S + 3.0)
+            process.wait(2 * PATIENCE_S + 4.0)  # both streams have given up remarks
         process.send_signal(number)
         assert process.wait(PATIENCE_S + LONG_S) == ExitCode.INTERRUPTED
         assert process.stderr.read() == "interrupted: the output was not read to its end\n"
