@@ -109,7 +109,8 @@ class OutputWriter:
             if piece.kind is OutputKind.REMARK:
                 # Until the losses are said, what comes later stays out as well: lines keep their order.
                 is_first = self._lost_lines == 0
-                if not is_first or self._waiting_bytes + size_bytes > REMARKS_BYTES:
+                is_full = self._waiting_bytes > 0 and self._waiting_bytes + size_bytes > REMARKS_BYTES
+                if is_full or not is_first:
                     if is_first:
                         self._pieces.put(Piece(OutputKind.LOSSES))
                     self._lost_lines += max(1, piece.content.count(b"\n"))
@@ -203,15 +204,20 @@ class OutputWriter:
         rest = memoryview(content)
         while rest and self.error is None and not self._is_abandoned:
             try:
-                written = self._write(self._descriptor, bytes(rest[:CHUNK_BYTES]))
-            except BlockingIOError:  # another program has made the file non-blocking
-                select.select([], [self._descriptor], [])
+                written = self._write_once(bytes(rest[:CHUNK_BYTES]))
             except OSError as error:
                 self.error = error
             else:
                 self._taken_bytes += written
                 rest = rest[written:]
         return not rest
+
+    def _write_once(self, content: bytes) -> int:
+        try:
+            return self._write(self._descriptor, content)
+        except BlockingIOError:  # another program has made the file non-blocking
+            select.select([], [self._descriptor], [])
+            return 0
 
 
 class _QueuedFile(io.RawIOBase):

@@ -123,6 +123,16 @@ def test_remarks_beyond_the_room_are_left_out_and_counted_in_their_place(file: F
     writer.close()
 
 
+def test_a_remark_that_is_larger_than_the_room_gets_out_where_nothing_waits(file: FakeFile) -> None:
+    file.reads.set()
+    writer = _writer(file)
+    content = b"x" * (REMARKS_BYTES + 1)
+    writer.put(Piece(OutputKind.REMARK, content))
+    writer.wait()
+    assert file.content == content
+    writer.close()
+
+
 def test_results_are_never_left_out(file: FakeFile) -> None:
     writer = _writer(file)
     part = b"r" * (REMARKS_BYTES // 2)
