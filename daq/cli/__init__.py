@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from daq.cli.output import write_if_taken
 from lazy_names import shadowed_package
 
 # More threads make linear algebra of this size slower and take several times the processor time. The libraries read the
@@ -27,5 +28,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return run(arguments)
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
+        write_if_taken("interrupted\n")
         return 130  # ExitCode.INTERRUPTED, which may not be imported yet

@@ -6,12 +6,11 @@ import codecs
 import gc
 import io
 import json
-import os
 import re
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from daq.cli.failure import ErrorParts, show_failure
+from daq.cli.output import QueuedOutput
 from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
 from daq.cli.verb import HELP_NAMES, Job, Verb
 from daq.environment import software
@@ -250,10 +250,8 @@ class _Verbs(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb; an interrupt, SIGTERM or SIGHUP is one line that says what was written."""
-        # Signals that are ignored stay so: nohup.
-        ending = tuple(one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is signal.SIG_DFL)
         try:
-            with interruptible(signals=ending):
+            with interruptible(signals=_ending_signals()):
                 return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
@@ -263,6 +261,11 @@ class _Verbs(TyperGroup):
                 said += "; the next `drivegain demo` into this folder starts anew and replaces it"
             say_last(printable(f"interrupted: {said}"))
             raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+
+
+def _ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals that end this process at once; those that are ignored stay so: nohup."""
+    return tuple(one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is signal.SIG_DFL)
 
 
 def build_app() -> typer.Typer:
@@ -294,21 +297,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
     STARTED.clear()
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        codecs.register_error("drivegain", _spelled)
-        sys.stdout.reconfigure(errors="drivegain")
     words = sys.argv[1:] if arguments is None else list(arguments)
     json_wanted = "--json" in words[: words.index("--") if "--" in words else None]
+    with QueuedOutput() as output:
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            codecs.register_error("drivegain", _spelled)
+            sys.stdout.reconfigure(errors="drivegain")
+        try:
+            code = _run(words, json_wanted)
+        except Exception:
+            if arguments is not None:
+                raise
+            # The interpreter would print it where nothing waits for a reader in its stead.
+            traceback.print_exc()
+            code = ExitCode.UNEXPECTED
+        finally:
+            remove_empty_folders()
+        return _handed_over(output, code, json_wanted)
+
+
+def _handed_over(output: QueuedOutput, code: int, json_wanted: bool) -> int:
+    """Wait for the reader of what was printed, unless an interrupt ends that; return the exit code."""
+    if code == ExitCode.INTERRUPTED:
+        return code
     try:
-        code = _run(words, json_wanted)
-    finally:
-        remove_empty_folders()
-    try:
-        # Flush here: at the end of the interpreter a failure could not be reported.
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        with interruptible(signals=(signal.SIGINT, *_ending_signals())):
+            output.wait_for_results()
     except OSError as error:
         return code or _output_failed(error, json_wanted)
+    except KeyboardInterrupt:
+        kept = _kept()
+        say_last(printable("interrupted: the output was not read to its end" + (f"; {kept}" if kept else "")))
+        return ExitCode.INTERRUPTED
     return code
 
 
@@ -382,15 +402,6 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
             failed.expected = "an output that takes what is printed"
             failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
         show_failure(ErrorParts.of(failed), json_wanted=json_wanted)
-    try:
-        sys.stdout.flush()
-    except OSError:
-        # The interpreter flushes stdout again at its end, and would complain.
-        with suppress(OSError):
-            null = os.open(os.devnull, os.O_WRONLY)
-            wanted = sys.stdout.fileno()
-            os.dup2(null, wanted)
-            os.close(null)
     return ExitCode.UNEXPECTED
 
 

@@ -9,6 +9,7 @@ import logging
 import math
 import os
 import shlex
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from daq.cli.output import wait_until_shown
 from daq.cli.terminal import (
     WRITTEN,
     at_most_one,
@@ -169,6 +171,7 @@ def apply_to(
             show_proposal(proposal, output_console(), known)
         try:
             if yes:
+                wait_until_shown(sys.stdout)  # what cannot be shown is not written
                 with whole or nullcontext(), write_output(edit.place) if edit.has_effect else nullcontext():
                     written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
@@ -332,6 +335,7 @@ def rollback_drives(
         if not json:
             show_drive_rollback(planned, console)
         if yes:
+            wait_until_shown(sys.stdout)  # what cannot be shown is not written
             with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
     if json:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import termios
+import time
 import webbrowser
 from array import array
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daq.cli.failure import ErrorParts
+from daq.cli.output import wait_until_shown
 from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
 from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
 from daq.environment import login
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
 YES = "yes"  #: What the operator types to write
 KEEP = "keep"  #: What the operator types where a block shows a mistake and is right all the same
+SHOWN_WITHIN_S = 0.5  #: A terminal that takes longer for a question was stopped
 MOVES = "moves"  #: Unit of the progress of a block
 
 
@@ -165,9 +168,10 @@ def ask(question: str) -> str:
     Raises:
         JobHeld: the input has ended.
     """
-    if _discard_typed_ahead():
-        tell("What was typed before this question does not count.")
-    typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
+    _show_question(question)
+    while not _shown_at_once():
+        tell("")  # the person has not seen it before, and may have typed meanwhile
+        _show_question(question)
     answer = sys.stdin.readline()
     if not answer:
         typer.echo("", err=True)
@@ -178,6 +182,19 @@ def ask(question: str) -> str:
             remedy="start the same command in a terminal; the session goes on where it is",
         )
     return answer.strip()
+
+
+def _show_question(question: str) -> None:
+    if _discard_typed_ahead():
+        tell("What was typed before this question does not count.")
+    typer.secho(printable(f">>> {question}: "), err=True, nl=False, bold=True)
+
+
+def _shown_at_once() -> bool:
+    """Wait until a question is on the screen; return whether nothing can have been typed before."""
+    began_s = time.monotonic()
+    wait_until_shown(sys.stdout, sys.stderr)
+    return time.monotonic() - began_s < SHOWN_WITHIN_S
 
 
 def _discard_typed_ahead() -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +10,7 @@ import typer
 
 from daq.cli.record import mounted
 from daq.cli.scan import no_answer
-from daq.cli.terminal import interruptible
+from daq.cli.terminal import interruptible, until_interrupted
 from daq.cli.verb import CellArgument, JsonOption, print_json, read_calibration, read_cell
 from daq.environment import require_packages
 from daq.errors import UsageError
@@ -32,8 +32,8 @@ def monitor_verb(
     enough for an acceleration. --json implies --once.
     """
     from rich.console import Console
-    from rich.live import Live
 
+    from daq.cli.patient_live import PatientLive
     from daq.config.cell_buses import cell_address, drive_axes
     from daq.log.feed import Feed
     from daq.report.bus_views import monitor_report, monitor_view
@@ -51,7 +51,7 @@ def monitor_verb(
     console = Console(highlight=False)
     policy = SdoPolicy(timeout_s=0.3, attempts=2)
     with (
-        suppress(KeyboardInterrupt),
+        until_interrupted(),
         interruptible(),
         Feed(cell, stop=None) as feed,
         CanopenNetwork(cell_address(declared), drive_axes(declared), policy=policy) as network,
@@ -73,7 +73,7 @@ def monitor_verb(
             return
         if feed.remark:
             console.print(feed.remark)
-        with Live(console=console, auto_refresh=False, screen=False) as live:
+        with PatientLive(console=console, auto_refresh=False, screen=False) as live:
             while True:
                 live.update(monitor_view(monitor_report(declared, watch.read(interval))), refresh=True)
 
@@ -119,7 +119,7 @@ def console_verb(
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]
     beside = []
-    with suppress(KeyboardInterrupt), ExitStack() as closing:
+    with until_interrupted(), ExitStack() as closing:
         try:
             listener = closing.enter_context(listen(port))
             if foxglove is not None:

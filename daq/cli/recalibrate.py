@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.advice import for_command_line
+from daq.cli.output import say_losses_as
 from daq.cli.terminal import interruptible, say
 from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.environment import login
@@ -44,6 +45,7 @@ def recalibrate_verb(
     from daq.jobs.journal import Form, Journal, Level, form_of
 
     journal = Journal(sys.stderr, form_of(sys.stderr, os.environ), lambda: datetime.now(UTC))
+    say_losses_as(lambda lines: journal.line(Level.WARNING, "lines left out: nothing read the output", lines=lines))
     try:
         _run(cell, dry_run, now, json, journal)
     except KeyboardInterrupt as interrupt:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from daq.cli.output import wait_until_shown
 from daq.cli.terminal import print_view, say
 from daq.cli.verb import (
     CalibrationArgument,
@@ -104,4 +105,5 @@ def sign_check_verb(
 def _password() -> str:
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
+    wait_until_shown(sys.stdout, sys.stderr)
     return str(typer.prompt("Password of the key", hide_input=True, err=True))

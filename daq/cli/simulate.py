@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import at_most_one, interruptible, output_console, print_view, replace_output, say, show_steps
+from daq.cli.terminal import (
+    at_most_one,
+    interruptible,
+    output_console,
+    print_view,
+    replace_output,
+    say,
+    show_steps,
+    until_interrupted,
+)
 from daq.cli.verb import JsonOption, output_option, print_json
 from daq.errors import ConfigurationInconsistent, UsageError, counted
 from daq.files import read_regular, replace_file
@@ -85,7 +94,7 @@ def simulate(
         scenario = shipped_simulation(faults.name) if shipped else faults
         spec = replace(spec, faults=spec.faults + load_scenario(scenario, len(spec.axes), spec.sync_period_us))
     # SIGHUP is left alone, so that nohup works.
-    with suppress(KeyboardInterrupt), interruptible(signals=(signal.SIGINT, signal.SIGTERM)), ExitStack() as stack:
+    with until_interrupted(), interruptible(signals=(signal.SIGINT, signal.SIGTERM)), ExitStack() as stack:
         there = nodes_on_buses(bus, [axis.node_id for axis in spec.axes]) if bus else {channel: frozenset()}
         hub = stack.enter_context(Hub(tuple(there), port)) if interface_of(interface) is SOCKETCAND else None
         parts = tuple(

@@ -20,6 +20,7 @@ import typer
 from rich.console import Console, RenderableType
 from rich.text import Text
 
+from daq.cli.output import release_results
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, writing
 from daq.files import is_taken, replace_file
@@ -347,11 +348,13 @@ def show_steps() -> Iterator[Stepper]:
         yield lines
         lines.end()
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
+    from daq.cli.patient_live import PatientProgress
 
     remark = TextColumn("{task.fields[remark]}", style="dim")
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
-    with Progress(*columns, console=console, refresh_per_second=5) as bars:
+    with PatientProgress(*columns, console=console, refresh_per_second=5) as bars:
         stepper = _Bars(bars)
         yield stepper
         stepper.end()
@@ -375,16 +378,33 @@ def progress_bar(title: str) -> Iterator[ProgressCallback]:
 @contextmanager
 def status(title: str) -> Iterator[Callable[[str], None]]:
     """Show work of unknown length on stderr: in a terminal a spinner with the step, elsewhere a line for each step."""
+    from rich.spinner import Spinner
+
+    from daq.cli.patient_live import PatientLive
+
     console = Console(stderr=True, highlight=False)
-    with console.status(title) as spinner:
+    spinner = Spinner("dots", title, style="status.spinner")
+    with PatientLive(spinner, console=console, refresh_per_second=SPINNER_HZ, transient=True):
 
         def show_step(step: str) -> None:
             if console.is_terminal:
-                spinner.update(terminal_text(step))
+                spinner.update(text=terminal_text(step))
             else:
                 console.print(f"  {step}", style="dim", soft_wrap=True)  # a line of a file, whatever its length
 
         yield show_step
+
+
+SPINNER_HZ = 12.5  #: Frames of the spinner a second
+
+
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """End a block that runs until Ctrl-C without an error; what it has printed is not waited for after that."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        release_results()
 
 
 @contextmanager

@@ -53,6 +53,14 @@ class Journal:
             event: what happened, always in the same words.
             fields: plain JSON; what JSON has no word for is spelt as text.
         """
+        line = self.line(level, event, **fields)
+        # A reader that has gone is no reason to leave a robot half-way through its job.
+        with suppress(OSError, ValueError):
+            self.stream.write(line)
+            self.stream.flush()
+
+    def line(self, level: Level, event: str, /, **fields: object) -> str:
+        """Return the line of an event, with its end; the arguments are those of `say`."""
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
             values = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in fields.items()}
@@ -65,10 +73,7 @@ class Journal:
             line = json.dumps(_plain(entry), ensure_ascii=False, allow_nan=False, default=str)
             if self.form is Form.JOURNAL:
                 line = f"<{int(level)}>{line}"
-        # A reader that has gone is no reason to leave a robot half-way through its job.
-        with suppress(OSError, ValueError):
-            self.stream.write(line + "\n")
-            self.stream.flush()
+        return line + "\n"
 
 
 def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:

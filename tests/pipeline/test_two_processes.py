@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 import signal
 import subprocess
@@ -16,6 +15,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from tests.pipeline.simulated_bus import served_cell
 
 pytestmark = pytest.mark.processes
 
@@ -23,22 +23,8 @@ pytestmark = pytest.mark.processes
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[Path]:
     """A cell file whose bus is the simulated cell's hub."""
-    folder = tmp_path_factory.mktemp("cell")
-    configs = checkout / "configs"
-    command = [sys.executable, "-m", "daq", "simulate", str(configs / "simulation" / "clean.yaml"), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=checkout) as process:
-        try:
-            assert process.stdout is not None
-            recorded = list(iter(process.stdout.readline, "\n")) + list(iter(process.stdout.readline, "\n"))
-            # What it prints to paste is pasted.
-            bus = "".join(recorded[recorded.index("bus:\n") :])
-            text = (configs / "cells" / "demo.yaml").read_text().replace("../robots", str(configs / "robots"))
-            path = folder / "cell.yaml"
-            path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL))
-            yield path
-        finally:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=20) == 0
+    with served_cell(tmp_path_factory.mktemp("cell"), checkout) as cell_file:
+        yield cell_file
 
 
 @pytest.fixture(scope="module")

@@ -635,6 +635,16 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, 
         assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
 
 
+def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
+    before = bench.controller.read_bytes()
+    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration), "--yes", "--cell", str(bench.cell)]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == ExitCode.UNEXPECTED
+    assert "no space left" in done.stderr
+    assert bench.controller.read_bytes() == before
+
+
 def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     plot, folder = bench.cell.with_name("gains.svg"), bench.cell.with_name("none")

@@ -6,6 +6,7 @@ import os
 import pty
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import TextIO
 
 import pytest
 
-from daq.cli.calibrate import ask
+from daq.cli.calibrate import SHOWN_WITHIN_S, ask
 from daq.errors import JobHeld
+from tests.daq.cli.screens import full_pipe, printing_to
 
 SECONDS_TO_WAIT = 20.0  #: For what takes milliseconds
 
@@ -101,3 +103,21 @@ def test_the_lines_of_a_pipe_are_answers(monkeypatch: pytest.MonkeyPatch, tmp_pa
         assert ask("Type yes") == "yes"
         with pytest.raises(JobHeld):
             ask("Anything else")
+
+
+def test_what_was_typed_before_a_stalled_screen_shows_the_question_does_not_answer_it(terminal: Terminal) -> None:
+    answers: list[str] = []
+    with full_pipe() as (reading, writing), printing_to(writing):
+        asking = threading.Thread(target=lambda: answers.append(ask("The robot moves now")), daemon=True)
+        asking.start()
+        time.sleep(2 * SHOWN_WITHIN_S)
+        terminal.press("\n")
+        assert not terminal.session_side.is_read.is_set()
+        shown = b""
+        while shown.count(b">>> The robot moves now: ") < 2:
+            shown += os.read(reading, 65536)
+        assert terminal.session_side.is_read.wait(SECONDS_TO_WAIT)
+        terminal.press("behind it\n")
+        asking.join(SECONDS_TO_WAIT)
+    assert answers == ["behind it"]
+    assert b"typed before this question does not count" in shown
