@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from daq.environment import shipped_configurations
 from drivers.canopen.pdo import Direction, PdoRecord, fixed_setpoints
 from drivers.errors import SetupRefused
 from drivers.motion.execute import execute
@@ -134,3 +135,33 @@ def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
     used = fixed_setpoints(command + PROFILE_RPDOS)
     assert [record.number for record in used] == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
     assert all(record.transmission == 1 for record in used)
+
+
+SHEETS = (*MAKES, "ros2_canopen_cia402_slave.eds")
+PROFILES = sorted(
+    path.stem for path in (shipped_configurations() / "drives").glob("*.yaml") if path.stem != "technosoft-ipos"
+)  # which needs an entry of a person
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("file", SHEETS)
+def test_each_data_sheet_is_set_up_by_each_profile_or_refused_in_words_and_left_as_it_was(
+    file: str, profile: str, shared_data: Path
+) -> None:
+    others = tuple(map(shipped, PROFILES))
+    network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile), profiles=lambda: others)
+    before = [settings(node) for node in bus.nodes]
+    try:
+        with network:
+            network.prepare()
+            assert network.readback().keys() == {"J1", "J2"}
+    except SetupRefused as refused:
+        said = str(refused)
+        assert said.startswith("J1 (node 1): ")
+        assert "found " in said
+        assert "; expected " in said or " expected " in said
+        assert getattr(refused, "__notes__", []) == []
+        if "expected every object of profile" in said:
+            assert written(bus) == []
+    assert MAKES.get(file) != profile or network.readback()
+    assert [settings(node) for node in bus.nodes] == before
