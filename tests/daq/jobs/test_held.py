@@ -342,6 +342,12 @@ def test_a_job_under_a_later_date_does_not_hold_the_next_ones(tmp_path: Path, ma
     assert not_counted(rig) == [str(wrong.folder)]
     right, last = rig.sessions
     assert last.folder == wrong.folder
+    # σ of the gains in force is that of the calibration which was written last, whatever its date is.
+    written = wrong.state.decision
+    compared = right.state.decision
+    assert written is not None
+    assert compared is not None
+    assert [gain.old_std for gain in compared.gains] == [gain.new_std for gain in written.gains]
     assert right.folder.name.startswith("20260105T03")
     rig.clock.go_on(hours=12)
     ended = rig.job()
