@@ -456,6 +456,7 @@ def writes_to(
     found: list[AuditedWrite] = []
     known: set[object] = set()
     owners = dict.fromkeys(targets, cell.name)
+    times = _times_by_number(entries)
     for one in entries:
         if not (is_end(one) or one.number in unended) or not (everywhere or one.subject in targets):
             continue
@@ -469,7 +470,7 @@ def writes_to(
             owner = None if write.begun is None else calibration_field(write.begun, "cell")
             owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
-            found.insert(_place(found, one), write)
+            found.insert(_place(found, one, times), write)
     return found
 
 
@@ -492,12 +493,26 @@ def _identity(one: AuditEntry) -> object:
     return one.number
 
 
-def _place(found: Sequence[AuditedWrite], one: AuditEntry) -> int:
+def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
+    """Return when entries were written, by their numbers, corrected where the clock was wrong.
+
+    A write that was found has the time of the write, which is out of the order of the log by intent.
+    """
+    timed = []
+    for one in entries:
+        at = at_of(one)
+        if at is not None and one.action is not AuditAction.WRITE_FOUND:
+            timed.append((one.number, at))
+    by_order = times_by_order([at for _, at in timed])
+    return {number: time or at for (number, at), time in zip(timed, by_order, strict=True)}
+
+
+def _place(found: Sequence[AuditedWrite], one: AuditEntry, times: Mapping[int, datetime]) -> int:
     """Return where a write belongs among the ones before; the entry of a found one may be younger than the write."""
     at = at_of(one)
     if one.action is AuditAction.WRITE_FOUND and at is not None:
         for place, other in enumerate(found):
-            other_at = at_of(other.ended)
+            other_at = times.get(other.ended.number) or at_of(other.ended)
             if other_at is not None and other_at > at:
                 return place
     return len(found)

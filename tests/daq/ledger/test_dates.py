@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from daq.ledger.audit import AuditAction, append
 from daq.ledger.dates import SET_CLOCK, longest_ordered, times_by_order
-from daq.ledger.fold import Entry
+from daq.ledger.fold import Entry, drives_of
 from daq.ledger.ledger import Ledger, enter_calibration, read_history
 from daq.ledger.watch import watch
 from ident.calibration import Calibration
 from tests.daq.calibrations import recorded
-from tests.daq.histories import BEGIN, calibration_of, digest_of, ledger_in, ledger_of
+from tests.daq.histories import BEGIN, calibration_of, digest_of, ledger_in, ledger_of, write
 
 FELL = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0)  #: Gain of J4, 10 % less
 
@@ -113,6 +114,22 @@ def test_history_says_which_date_was_wrong(checkout: Path, tmp_path: Path, capsy
     assert main(["history", str(file), "--json"]) == ExitCode.OK
     (axis, *_) = json.loads(capsys.readouterr().out)["axes"]
     assert ["misdated" in point for point in axis["points"]] == [False, False, True, False, False]
+
+
+def test_a_write_that_was_found_is_in_force_after_one_of_a_wrong_later_date(tmp_path: Path) -> None:
+    """By their dates the older write would be the last one, and its gains and their σ those in force."""
+    ledger = ledger_in(tmp_path)
+    target = drives_of(ledger.cell.name)
+    digests = [enter_at(ledger, calibration_of(number), week(number)) for number in range(3)]
+    write(ledger, target, "a" * 64, digest=digests[0], at=week(0))
+    write(ledger, target, "b" * 64, digest=digests[1], at=week(1) + timedelta(days=730))
+    details: dict[str, object] = {"sha256_before": "b" * 64, "sha256_after": "c" * 64, "action": "applied"}
+    details |= {"calibration": {"sha256": digests[2], "cell": ledger.cell.name}}
+    append(ledger.audit, AuditAction.WRITE_FOUND, at=week(2), who="anna", subject=target, details=details)
+    write(ledger, str(tmp_path / "another"), "d" * 64, digest=digests[0], at=week(3))
+    history = read_history(ledger)
+    assert [event.digest for event in history.events if event.target == target] == digests
+    assert history.in_force(target) == digests[2]
 
 
 def test_times_in_order_are_left_alone() -> None:
