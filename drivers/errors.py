@@ -141,7 +141,8 @@ class NodeMissing(DriverError):
     def __init__(self, nodes: Sequence[Node], found: tuple[int, ...], waited_s: float) -> None:
         super().__init__(
             f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s "
-            f"(answered: {', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id"
+            f"(answered: {', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id; a drive "
+            "that was switched on just now answers once it has booted: try again then"
         )
         self.node_ids = tuple(node if isinstance(node, int) else node.node_id for node in nodes)
         self.found = found
@@ -277,9 +278,15 @@ class MotionTimeout(DriverError):
         if acknowledge is None:
             found = "did not reach the target"
             remedy = "check brakes and limits, or use slower moves"
-        else:
-            found = f"did not {'set' if acknowledge else 'clear'} statusword bit 12 (set-point acknowledge)"
+        elif acknowledge:
+            found = "did not set statusword bit 12 (set-point acknowledge)"
             remedy = "check that the drive is in profile position mode (6061h = 1) and accepts set-points by RPDO"
+        else:
+            found = "did not clear statusword bit 12 (set-point acknowledge)"
+            remedy = (
+                "the drive still works on an earlier set-point: check that it is in profile position mode (6061h = 1) "
+                "and that nothing else gives it set-points; switch it off and on"
+            )
         if other_master:
             found = f"{found}, and {other_master},"
             remedy = f"end the other program first; else {remedy}"

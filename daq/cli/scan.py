@@ -11,12 +11,13 @@ import typer
 
 from daq.cli.next_step import say_next
 from daq.cli.terminal import print_view, say
-from daq.cli.verb import CellArgument, JsonOption, print_json, read_cell
+from daq.cli.verb import CellArgument, JsonOption, print_json
 from daq.errors import ConfigurationInconsistent, UsageError, VirtualBusEmpty
 from drivers.errors import DriverError, NodeMissing
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell
+    from daq.config.cell import Wired
+    from daq.config.wiring import AxisWiring
     from drivers.canopen.bus import BusAddress
     from drivers.canopen.network import CanopenNetwork
     from drivers.canopen.node_scan import FoundNode
@@ -39,46 +40,51 @@ def scan_verb(
     with the motors' data in the drives and with the current gains. Nothing is changed without
     --reset-faults; find out why an axis is in fault before you reset it. While a recording or
     another master uses the bus, nothing is sent: exit code 12 or 5.
+    Of a cell file that other verbs refuse, the buses and node ids are enough; what is missing is said.
     Exit code 5 also where an axis does not answer; what else is wrong is in the table, as another
     serial number is, and `record` refuses it.
     """
-    from daq.config.cell_buses import bus_parts, drive_axes
+    from daq.config.cell_buses import bus_parts
+    from daq.config.wiring import read_wiring
     from daq.report.bus_views import scan_report, scan_view, scanned_nodes
     from daq.workflow.bus_lock import bus_lock
     from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 
-    declared = read_cell(cell)
+    wiring, declared = read_wiring(cell)
     found: dict[str, tuple[FoundNode, ...]] = {}
-    misfits: dict[str, str] = {}
+    misfits = {axis.name: axis.profile_fault for axis in wiring.axes if axis.profile_fault}
     scales: dict[str, ScaleReading | None] = {}
     causes: dict[str, str] = {}
-    with bus_lock(declared):
-        for part in bus_parts(declared):
-            axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
+    with bus_lock(wiring):
+        for part in bus_parts(wiring):
+            axes = tuple(axis for axis in wiring.axes if axis.bus == part.name)
             scanned = _scan_bus(part.address, axes, wait, reset_faults)
             found[part.name] = scanned.nodes
             scales |= scanned.scales
             misfits |= scanned.misfits
             causes |= scanned.causes
-    readings = [scales.get(name) for name in declared.axis_names]
     mistyped: list[str] = []
-    try:
-        check_nameplates(cell, declared, readings)
-    except ConfigurationInconsistent as error:
-        mistyped.append(str(error))
+    warnings: tuple[str, ...] = ()
+    if declared is not None:
+        readings = [scales.get(name) for name in declared.axis_names]
+        warnings = nameplate_warnings(declared, readings)
+        try:
+            check_nameplates(cell, declared, readings)
+        except ConfigurationInconsistent as error:
+            mistyped.append(str(error))
     listed = []
     for name, nodes in found.items():
-        listed += scanned_nodes(declared, nodes, name, misfits)
-    report = scan_report(declared, listed, causes, mistyped, nameplate_warnings(declared, readings))
+        listed += scanned_nodes(wiring, nodes, name, misfits)
+    report = scan_report(wiring, listed, causes, mistyped, warnings, wiring.fault)
     if json:
         print_json(report)
     else:
         print_view(scan_view(report))
     absent = {node.node_id for node in listed if node.verdict == "missing"}
-    missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
+    missing = [_amplifier(axis) for axis in wiring.axes if axis.node_id in absent]
     if missing:
-        raise no_answer(declared, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
-    if not json and not mistyped and all(node.verdict == "ok" for node in listed):
+        raise no_answer(wiring, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
+    if not json and declared is not None and not mistyped and all(node.verdict == "ok" for node in listed):
         say_next("drivegain", "calibrate", cell, "--check")
 
 
@@ -94,7 +100,7 @@ class ScannedBus:
 
 def _scan_bus(
     address: BusAddress,
-    axes: tuple[Axis, ...],
+    wired: tuple[AxisWiring, ...],
     wait_s: float,
     reset_faults: bool,
 ) -> ScannedBus:
@@ -107,10 +113,12 @@ def _scan_bus(
     from drivers.canopen.network import CanopenNetwork
     from drivers.profiles.cia402 import State
 
+    axes = tuple(_amplifier(axis) for axis in wired)
+    with_profile = {axis.node_id for axis in wired if axis.profile is not None}
     with CanopenNetwork(address, axes) as network:
         nodes = network.scan(wait_s=wait_s)
         sound = {node.node_id for node in nodes if node.identity and not node.problems}
-        here = [axis for axis in axes if axis.node_id in sound]
+        here = [axis for axis in axes if axis.node_id in sound & with_profile]
         scales = {axis.name: _scale_of(network, axis) for axis in here}
         misfits = {axis.name: text for axis in here if (text := _misfit_of(network, axis))}
     in_fault = {node.node_id for node in nodes if node.state is State.FAULT}
@@ -126,7 +134,7 @@ def _scan_bus(
     return ScannedBus(nodes, scales, misfits, causes)
 
 
-def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:
+def no_answer(cell: Wired, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:
     """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
     from daq.cli.simulate import SHIPPED
 
@@ -140,6 +148,13 @@ def no_answer(cell: Cell, missing: Sequence[Axis], answered: tuple[int, ...], wa
         remedy=f"start `drivegain simulate {name}`, and put the `bus` and `sync` that it prints into a copy of the "
         "cell file",
     )
+
+
+def _amplifier(axis: AxisWiring) -> Axis:
+    """Axis for the bus; without a profile it is that of the standard, whose current and position are not read."""
+    from drivers.profiles.profile import CIA402, Axis
+
+    return Axis(axis.name, axis.node_id, axis.profile or CIA402, axis.identity)
 
 
 def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:

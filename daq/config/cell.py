@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from math import pi
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 from pydantic import Field
 
@@ -159,6 +160,46 @@ class DeclaredEffect:
     axis: int  #: index among `Cell.place_names` of the axis, or joint without a motor, that it acts on
     #: Its settings by name, where they are known; a fit of the effect begins with them. Empty: the fit finds them.
     settings: dict[str, float]
+
+
+class WiredAxis(Protocol):
+    """An amplifier, as far as its bus is concerned."""
+
+    @property
+    def name(self) -> str:
+        """Name of the axis."""
+
+    @property
+    def node_id(self) -> int | None:
+        """Node id; None in a cell that only imports recordings."""
+
+    @property
+    def bus(self) -> str | None:
+        """Name of its bus."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Identity that the cell file expects; None where it expects none."""
+
+    @property
+    def profile(self) -> DriveProfile | None:
+        """Its profile; None where it is not known."""
+
+
+class Wired(Protocol):
+    """What a bus is found with: a `Cell`, or the `Wiring` of a cell file that is wrong elsewhere."""
+
+    @property
+    def name(self) -> str:
+        """Name of the cell."""
+
+    @property
+    def buses(self) -> tuple[Bus, ...]:
+        """Its buses."""
+
+    @property
+    def axes(self) -> Sequence[WiredAxis]:
+        """Its amplifiers."""
 
 
 class MotionPolicy(Enum):

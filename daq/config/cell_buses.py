@@ -9,7 +9,7 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import drivers
-from daq.config.cell import KERNEL, RECORDER, Bus, Cell, PacingMode, Sync
+from daq.config.cell import KERNEL, RECORDER, Bus, Cell, PacingMode, Sync, Wired
 from daq.config.cell_schema import CellModel
 from daq.config.yaml_file import Fault, Location
 from daq.errors import ConfigurationInconsistent
@@ -259,7 +259,7 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
         yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})")
 
 
-def cell_address(cell: Cell) -> CellAddress:
+def cell_address(cell: Wired) -> CellAddress:
     """Return the address of a cell's bus, or of its buses.
 
     Raises:
@@ -269,7 +269,7 @@ def cell_address(cell: Cell) -> CellAddress:
     return parts[0].address if len(parts) == 1 else drivers.SplitAddress(parts)
 
 
-def bus_parts(cell: Cell) -> tuple[drivers.BusPart, ...]:
+def bus_parts(cell: Wired) -> tuple[drivers.BusPart, ...]:
     """Return each bus of a cell with the nodes that should be on it.
 
     Raises:
@@ -279,7 +279,8 @@ def bus_parts(cell: Cell) -> tuple[drivers.BusPart, ...]:
     if not cell.buses:
         raise _no_bus(cell, "no bus")
     parts = []
-    for bus, axes in cell.wiring:
+    for bus in cell.buses:
+        axes = [axis for axis in cell.axes if axis.bus == bus.name]
         names = {axis.node_id: axis.name for axis in axes if axis.node_id is not None}
         parts.append(drivers.BusPart(bus.name, _address(bus), frozenset(names), names))
     return tuple(parts)
@@ -371,7 +372,7 @@ def _address(bus: Bus) -> drivers.BusAddress:
     return drivers.BusAddress(bus.interface, bus.channel, bus.bitrate_bit_s, bus.host, bus.port)
 
 
-def _no_bus(cell: Cell, found: str) -> ConfigurationInconsistent:
+def _no_bus(cell: Wired, found: str) -> ConfigurationInconsistent:
     return ConfigurationInconsistent(
         f"cell {cell.name!r}",
         found=found,

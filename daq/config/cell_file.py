@@ -210,7 +210,7 @@ def _sources(path: Path) -> dict[str, Path]:
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), CellModel)
     sources = {CELL: path, URDF: path.parent / model.robot.urdf}
     for drive in model.drives:
-        profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
+        profile = sources[f"{DRIVES}{drive}.yaml"] = drive_path(path.parent, drive)
         tree = parse_yaml(read_yaml_bytes(profile), str(profile)).tree
         if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
             sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
@@ -239,7 +239,7 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
     return content
 
 
-def _drive_path(folder: Path, drive: str) -> Path:
+def drive_path(folder: Path, drive: str) -> Path:
     """Find a profile beside the cell (drives/ or ../drives/), else the shipped one."""
     file = f"{drive}.yaml"
     candidates = (folder / "drives" / file, folder.parent / "drives" / file, shipped_configurations() / "drives" / file)

@@ -60,6 +60,14 @@ Buses = Annotated[
 """One bus, or a list of named buses."""
 
 
+def buses_of(declared: UnnamedBus | tuple[Bus, ...]) -> tuple[Bus, ...]:
+    """Return the declared buses, each with a name."""
+    if isinstance(declared, tuple):
+        return declared
+    values = {key.name: getattr(declared, key.name) for key in fields(UnnamedBus)}
+    return (Bus(name=declared.channel, **values),)
+
+
 class IdentityModel(StrictModel):
     """Object 1018h; what is left out is not compared."""
 
@@ -303,10 +311,7 @@ class CellModel(StrictModel):
     @property
     def buses(self) -> tuple[Bus, ...]:
         """All buses, with names; empty in a cell that only imports recordings."""
-        if self.bus is None or isinstance(self.bus, tuple):
-            return self.bus or ()
-        declared = {key.name: getattr(self.bus, key.name) for key in fields(UnnamedBus)}
-        return (Bus(name=self.bus.channel, **declared),)
+        return () if self.bus is None else buses_of(self.bus)
 
     def bus_of(self, axis: AxisModel) -> str | None:
         """Return the name of an axis's bus; the only bus of a cell need not be named."""

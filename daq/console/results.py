@@ -7,6 +7,8 @@ none of them.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from daq.errors import DaqError, ExitCode
 from daq.jobs.guided import motion_left_s
 from daq.jobs.position import position_of, sessions_folder
 from daq.jobs.reporting import Conclusion, to_do
-from daq.jobs.session import CALIBRATION, REPORT, Session, sessions
+from daq.jobs.session import CALIBRATION, REPORT, Session, begun_until, sessions
 from daq.ledger.ledger import MAY_LACK, Ledger, read_history
 from daq.ledger.watch import alarm_text, watch
 from daq.report.residual_page import PAGE
@@ -33,10 +35,16 @@ class Results:
     """Reads the files again when they have changed."""
 
     def __init__(
-        self, cell_file: Path, cell: Cell, calibration: Path | None = None, report: Path | None = None
+        self,
+        cell_file: Path,
+        cell: Cell,
+        calibration: Path | None = None,
+        report: Path | None = None,
+        now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         """Store the places that may be read; calibration and folder of the report are those of the command line."""
         self._cell_file, self._cell, self._calibration, self._report = cell_file, cell, calibration, report
+        self._now = now
         self._read: dict[Path, tuple[tuple[int, int], Calibration]] = {}
 
     def calibration(self) -> tuple[Path, Calibration] | None:
@@ -87,11 +95,13 @@ class Results:
 
     def _newest_job(self) -> Session | None:
         section = self._cell.recalibration
-        past = () if section is None else sessions(section.folder, self._cell.name)
-        return past[-1] if past else None
+        return None if section is None else self._newest_in(section.folder)
 
     def _newest_guided(self) -> Session | None:
-        past = sessions(sessions_folder(self._cell_file), self._cell.name)
+        return self._newest_in(sessions_folder(self._cell_file))
+
+    def _newest_in(self, folder: Path) -> Session | None:
+        past = begun_until(sessions(folder, self._cell.name), self._now())
         return past[-1] if past else None
 
     def _report_path(self) -> Path | None:

@@ -14,7 +14,7 @@ from daq.documents.session_state import GuidedState
 from daq.errors import ConfigurationInconsistent, DaqError
 from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock
+from daq.jobs.context import SessionContext, Tools, before_motion, sessions_that_count
 from daq.jobs.gain_target import target_of
 from daq.jobs.guided import (
     GuidedSettings,
@@ -107,8 +107,7 @@ def _resumed_or_new(context: SessionContext) -> Session:
     """Take up the newest session if it is unfinished, of the same cell file and recent; else begin one."""
     now = context.tools.now()
     folder = context.settings.folder
-    found = sessions.sessions(folder, context.cell.name)
-    require_clock(found, now)
+    found = sessions_that_count(sessions.sessions(folder, context.cell.name), now, context.journal)
     session = sessions.resumable_session(found, session_basis(context.cell), now, RESUME_WITHIN_H)
     if session is None:
         _say_why_new(context, found, now)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ from daq.jobs.certificate import renew_certificate
 from daq.jobs.gain_target import GainTarget, NetworkMaker
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
-from daq.jobs.session import Session
+from daq.jobs.session import Session, begun_until
 from daq.ledger.ledger import Ledger, read_history
 from daq.report.certificate import Certificate
 from daq.report.plan_preview import save_preview
@@ -47,8 +47,8 @@ from ident.discovery.evidence import Evidence
 from ident.discovery.loop import Step
 from ident.errors import Diagnosis
 
-CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
-
+PROGRAM_SINCE = datetime(2026, 1, 1, tzinfo=UTC)
+"""No right clock is before this program was made: a computer without battery begins in 1970, or at an older date."""
 
 # A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop when it stays away,
 # so a session waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE
@@ -392,21 +392,34 @@ def section_of(cell: Cell) -> Recalibration:
     return cell.recalibration
 
 
-def require_clock(found: tuple[Session, ...], now: datetime) -> None:
-    """Check that the clock is not behind the times of the recorded sessions.
+def sessions_that_count(found: tuple[Session, ...], now: datetime, journal: Journal) -> tuple[Session, ...]:
+    """Return the sessions of the past, and say those that were made under a later date.
+
+    A date that was wrong once must not hold every job until that day comes. The session is left as it is, for a person.
 
     Raises:
-        JobHeld: the clock is behind the newest session.
+        JobHeld: the clock is before this program was made, so it is the clock that is wrong.
     """
-    last = max(found, key=lambda session: session.last_written, default=None)
-    if last is not None and now + CLOCK_SLACK < last.last_written:
+    if now < PROGRAM_SINCE:
         raise JobHeld(
             "the clock of this computer",
             found=now.isoformat(timespec="seconds"),
-            expected=f"a time after {last.last_written.isoformat(timespec='seconds')}, found in {last.folder}",
-            remedy="set the clock (`timedatectl`), or where it is right, move that folder away: it was made by a wrong "
-            "one; ages, history and audit would be in the wrong order",
+            expected=f"a time after {PROGRAM_SINCE:%Y-%m-%d}, when this program was made",
+            remedy="nothing was begun; set the clock (`timedatectl`): ages of calibrations, names of folders, history "
+            "and audit log depend on it",
         )
+    counted = begun_until(found, now)
+    for session in found:
+        if session in counted:
+            continue
+        text = (
+            f"found {session.folder}, begun {session.state.began}; expected a time before now, "
+            f"{now.isoformat(timespec='seconds')}; it counts neither for what is due nor as the last calibration, and "
+            "is not continued. If it was made under a wrong date, move the folder away once its logs are not needed; "
+            "if the clock is behind now, set it (`timedatectl`)"
+        )
+        journal.say(Level.WARNING, "a session from the future does not count", text=text, folder=str(session.folder))
+    return counted
 
 
 def before_motion(context: SessionContext, *, take_over: bool = True) -> None:

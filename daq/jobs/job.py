@@ -16,7 +16,7 @@ from daq.config.recalibration import Recalibration
 from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, TimeBoundReached
 from daq.jobs import session as sessions
-from daq.jobs.context import SessionContext, Tools, before_motion, require_clock, section_of
+from daq.jobs.context import SessionContext, Tools, before_motion, section_of, sessions_that_count
 from daq.jobs.gain_target import file_of
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import CellPolicy
@@ -48,14 +48,19 @@ def recalibrate(
     """
     section = section_of(cell)
     context = _context(cell_file, cell, tools, journal, who)
-    if (early := _not_due(section, cell, tools.now())) is not None:
+    now = tools.now()
+    early = _not_due(section, cell, _counted(section, cell, now, journal), now)
+    if early is not None:
         journal.say(Level.INFO, "not due", remark=early.remark)
         return early
     with bus_lock(cell, lock_folder):
         # Another job may have ended since.
-        if (early := _not_due(section, cell, tools.now())) is not None:
+        now = tools.now()
+        found = sessions.begun_until(sessions.sessions(section.folder, cell.name), now)
+        early = _not_due(section, cell, found, now)
+        if early is not None:
             return early
-        session = _resumed_or_new(section, cell, tools.now(), journal)
+        session = _resumed_or_new(section, cell, found, now, journal)
         journal = replace(journal, session=session.state.session)
         context = replace(context, journal=journal, began_s=tools.monotonic_s())
         try:
@@ -93,10 +98,13 @@ def preview(
     section = section_of(cell)
     context = _context(cell_file, cell, tools, journal, who)
     now = tools.now()
-    if (early := _not_due(section, cell, now)) is not None:
+    found = _counted(section, cell, now, journal)
+    early = _not_due(section, cell, found, now)
+    if early is not None:
         return Preview((), early.remark)
     with bus_lock(cell, lock_folder):
-        session = _open_session(section, cell, sessions.sessions(section.folder, cell.name), now)
+        found = sessions.begun_until(sessions.sessions(section.folder, cell.name), now)
+        session = _open_session(section, cell, found, now)
         made = () if session is None else tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
@@ -128,10 +136,13 @@ def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: s
     )
 
 
-def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
-    """Conclude early where no calibration is due; also checks the clock, on which every age depends."""
-    found = sessions.sessions(section.folder, cell.name)
-    require_clock(found, now)
+def _counted(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> tuple[Session, ...]:
+    """Return the sessions of the cell that count at this time; see `sessions_that_count`."""
+    return sessions_that_count(sessions.sessions(section.folder, cell.name), now, journal)
+
+
+def _not_due(section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime) -> Conclusion | None:
+    """Conclude early where no calibration is due."""
     good = sessions.last_good(found)
     left = timedelta(0) if good is None else good.began + timedelta(hours=section.every_h) - now
     if good is None or left <= timedelta(0):
@@ -150,8 +161,10 @@ def _open_session(section: Recalibration, cell: Cell, found: tuple[Session, ...]
     return sessions.resumable_session(found, basis_of(cell, section), now, section.resume_within_h)
 
 
-def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
-    session = _open_session(section, cell, sessions.sessions(section.folder, cell.name), now)
+def _resumed_or_new(
+    section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime, journal: Journal
+) -> Session:
+    session = _open_session(section, cell, found, now)
     if session is None:
         session = sessions.begin(section.folder, basis_of(cell, section), now)
         replace(journal, session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))

@@ -137,7 +137,7 @@ def _report(context: SessionContext, ended: Conclusion, session: Session, proble
     finally:
         # Last: a session that is over has its summary, also after a kill.
         sessions.save(session)
-    found = sessions.sessions(context.settings.folder, context.cell.name)
+    found = sessions.begun_until(sessions.sessions(context.settings.folder, context.cell.name), now)
     if context.settings.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
         try:

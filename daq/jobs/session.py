@@ -20,6 +20,7 @@ from daq.documents.session_state import GuidedState, JobState, SessionState
 from daq.errors import ConfigurationInconsistent, reason_of, writing
 from daq.files import read_regular, replace_file
 
+CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
 STATE = "state.json"
 CALIBRATION = "calibration.yaml"
 REPORT = "report"
@@ -48,11 +49,6 @@ class Session:
         """Whether no job resumes it."""
         return self.state.is_over
 
-    @property
-    def last_written(self) -> datetime:
-        """Latest time in its state."""
-        return max(_times(self.state))
-
     def update(self, **changed: object) -> Session:
         """Change some values of the state, and write it as `save`."""
         return save(replace(self, state=self.state.with_(**changed)))
@@ -74,6 +70,15 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
         read = ((entry, _read(entry / STATE)) for entry in folders)
         found = [Session(entry, state) for entry, state in read if state is not None and cell in (None, state.cell)]
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
+
+
+def begun_until(found: tuple[Session, ...], now: datetime) -> tuple[Session, ...]:
+    """Return the sessions that began by now.
+
+    One that begins later was made under a wrong date. By its date it would be the newest one for as long, so no age, no
+    order and no removal counts it.
+    """
+    return tuple(session for session in found if session.began - now <= CLOCK_SLACK)
 
 
 def session_of(calibration: Path, digest: str) -> str | None:
@@ -185,7 +190,7 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
     """Remove old sessions, except the last good one and those whose calibration is in force.
 
     Args:
-        found: oldest first.
+        found: oldest first, those that count (`begun_until`).
         keep: number of the newest sessions to keep.
         in_force: digests of the calibrations in force: their logs and signatures are the evidence for current gains.
 

@@ -14,6 +14,7 @@ from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
+from daq.ledger.dates import corrected, times_by_order
 from ident.calibration import Calibration, Gain, Source
 
 
@@ -57,6 +58,9 @@ class Entry:
     gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
     events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
     acceptance: RecordedAcceptance | None = None  #: result of the last new moves with its gains; None without any
+    #: `created` by the clock of that day, where the order of the audit log shows that it was wrong; else None. Then
+    #: `created` and `recorded` are what that order allows.
+    created_by_clock: datetime | None = None
 
     def gain_of(self, axis: str) -> Gain | None:
         """Return the gain of an axis, None for an axis that it does not have."""
@@ -253,6 +257,7 @@ class EnteredCalibration:
 
     number: int  #: of the entry
     digest: str  #: SHA-256 of its file
+    at: datetime  #: time of the entry itself; later than the next where a history of an earlier version was taken in
     entered: datetime  #: when it was entered, UTC
     document: str | None  #: the whole calibration; None where an earlier entry has it
     figures: dict[str, Any] | None  #: as of `figures_of`; None in an entry of an earlier version
@@ -272,10 +277,16 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     accepted = {one.digest: one for one in acceptances}  # the last one of each calibration
     found: list[Entry] = []
     unreadable: list[str] = []
-    for one in entered_calibrations(entries, cell.name):
+    calibrations = entered_calibrations(entries, cell.name)
+    by_order = times_by_order([one.at for one in calibrations])
+    recorded: dict[str, datetime] = {}  # of logs, by calibrations that were entered while the clock was right
+    for one, time in zip(calibrations, by_order, strict=True):
         try:
             figures = one.figures or figures_of_document(one)
             entry = entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ()))
+            if time is None:
+                recorded.setdefault(entry.logs, entry.recorded)
+            entry = _dated(entry, one.at, time, recorded)
             found.append(replace(entry, acceptance=accepted.get(one.digest)))
         except DaqError as error:
             unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
@@ -290,6 +301,22 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         acceptances=acceptances,
         unreadable=tuple(unreadable),
     )
+
+
+def _dated(entry: Entry, at: datetime, by_order: datetime | None, known: Mapping[str, datetime]) -> Entry:
+    """Return a calibration with the dates that the order of the audit log allows.
+
+    Args:
+        entry: as it was entered.
+        at: time of its entry in the log, by the clock.
+        by_order: the same by the order of the log; None where the clock agrees with it.
+        known: when logs were recorded that an earlier calibration rests on, too.
+    """
+    if by_order is None:
+        return entry
+    created = corrected(entry.created, at, by_order)
+    recorded = known.get(entry.logs) or corrected(entry.recorded, at, by_order)
+    return replace(entry, created=created, recorded=recorded, created_by_clock=entry.created)
 
 
 def figures_of_document(one: EnteredCalibration) -> dict[str, object]:
@@ -351,7 +378,7 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     known = figures if isinstance(figures, dict) else None
     if digest is None or entered == _NEVER or (document is None and known is None):
         return None
-    return EnteredCalibration(entry.number, digest, entered, document, known)
+    return EnteredCalibration(entry.number, digest, at_of(entry) or entered, entered, document, known)
 
 
 def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
@@ -429,6 +456,7 @@ def writes_to(
     found: list[AuditedWrite] = []
     known: set[object] = set()
     owners = dict.fromkeys(targets, cell.name)
+    times = _times_by_number(entries)
     for one in entries:
         if not (is_end(one) or one.number in unended) or not (everywhere or one.subject in targets):
             continue
@@ -442,7 +470,7 @@ def writes_to(
             owner = None if write.begun is None else calibration_field(write.begun, "cell")
             owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
-            found.insert(_place(found, one), write)
+            found.insert(_place(found, one, times), write)
     return found
 
 
@@ -465,12 +493,26 @@ def _identity(one: AuditEntry) -> object:
     return one.number
 
 
-def _place(found: Sequence[AuditedWrite], one: AuditEntry) -> int:
+def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
+    """Return when entries were written, by their numbers, corrected where the clock was wrong.
+
+    A write that was found has the time of the write, which is out of the order of the log by intent.
+    """
+    timed = []
+    for one in entries:
+        at = at_of(one)
+        if at is not None and one.action is not AuditAction.WRITE_FOUND:
+            timed.append((one.number, at))
+    by_order = times_by_order([at for _, at in timed])
+    return {number: time or at for (number, at), time in zip(timed, by_order, strict=True)}
+
+
+def _place(found: Sequence[AuditedWrite], one: AuditEntry, times: Mapping[int, datetime]) -> int:
     """Return where a write belongs among the ones before; the entry of a found one may be younger than the write."""
     at = at_of(one)
     if one.action is AuditAction.WRITE_FOUND and at is not None:
         for place, other in enumerate(found):
-            other_at = at_of(other.ended)
+            other_at = times.get(other.ended.number) or at_of(other.ended)
             if other_at is not None and other_at > at:
                 return place
     return len(found)

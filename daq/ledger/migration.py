@@ -127,7 +127,7 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
 def _content(connection: sqlite3.Connection) -> StoredHistory:
     """Read all rows; raises ValueError for one that drivegain did not write."""
     rows = connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest")
-    calibrations = [EnteredCalibration(0, str(row[0]), zoned(row[1]), str(row[2]), None) for row in rows]
+    calibrations = [EnteredCalibration(0, str(row[0]), zoned(row[1]), zoned(row[1]), str(row[2]), None) for row in rows]
     events = []
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, after in connection.execute(query):

@@ -18,7 +18,7 @@ from drivers.canopen.emcy import CODES
 from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell, CellAxis
+    from daq.config.cell import Cell, CellAxis, Wired, WiredAxis
     from daq.workflow.monitor import WatchedCell
     from drivers.canopen.emcy import ErrorCode
     from drivers.canopen.node_scan import FoundNode
@@ -192,6 +192,8 @@ class ScanReport(Report):
     """nameplate gains that plan or record would refuse"""
     warnings: list[str]
     """what record would warn of, such as a gain that is near √2 times the drive's"""
+    cell_fault: str
+    """why every other verb refuses the cell file, apart from the profiles in `remarks`; empty where none does"""
 
 
 def error_code_report(found: ErrorCode) -> ErrorCodeReport:
@@ -200,11 +202,12 @@ def error_code_report(found: ErrorCode) -> ErrorCodeReport:
 
 
 def scan_report(
-    cell: Cell,
+    cell: Wired,
     nodes: Sequence[ScannedNode],
     faults: Mapping[str, str],
     mistyped: Sequence[str],
     warnings: Sequence[str],
+    cell_fault: str = "",
 ) -> ScanReport:
     """Return what a scan of all buses found.
 
@@ -214,6 +217,7 @@ def scan_report(
         faults: of each axis that was reset.
         mistyped: nameplates that `plan` and `record` would refuse.
         warnings: what `record` would warn of.
+        cell_fault: why every other verb refuses the cell file; empty where none does.
     """
     return ScanReport.of(
         bus=str(cell_address(cell)),
@@ -223,6 +227,7 @@ def scan_report(
         current=current_signals(cell),
         mistyped=mistyped,
         warnings=warnings,
+        cell_fault=cell_fault,
     )
 
 
@@ -243,10 +248,16 @@ def scan_view(report: ScanReport) -> Iterator[RenderableType]:
             "yellow",
         )
     yield from (Text(printable(text), "yellow") for text in (*report.mistyped, *report.warnings))
+    if report.cell_fault:
+        yield Text(
+            f"The drives were found by the wiring alone; every other command refuses the cell file: "
+            f"{printable(report.cell_fault)}",
+            "yellow",
+        )
 
 
 def scanned_nodes(
-    cell: Cell, found: Sequence[FoundNode], bus: str, misfits: Mapping[str, str] | None = None
+    cell: Wired, found: Sequence[FoundNode], bus: str, misfits: Mapping[str, str] | None = None
 ) -> list[ScannedNode]:
     """Return the nodes of one bus, configured or found; `misfits` describes objects that a drive lacks, by axis."""
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
@@ -259,7 +270,7 @@ def scanned_nodes(
 
 
 def _scanned_node(
-    bus: str, node_id: int, home: CellAxis | None, node: FoundNode | None, misfits: Mapping[str, str]
+    bus: str, node_id: int, home: WiredAxis | None, node: FoundNode | None, misfits: Mapping[str, str]
 ) -> ScannedNode:
     """Return one node; `home` is the axis that has its number, on this bus or on another."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
@@ -296,7 +307,7 @@ def _state(statusword: int | None) -> dict[str, str | bool | None]:
     return {"state": str(state), "enabled": state in ENABLED}
 
 
-def _verdict(home: CellAxis | None, axis: CellAxis | None, node: FoundNode | None, misfit: str) -> str:
+def _verdict(home: WiredAxis | None, axis: WiredAxis | None, node: FoundNode | None, misfit: str) -> str:
     """Return what is to be said first of a node, its fault apart."""
     if node is None:
         return "missing"
@@ -309,7 +320,8 @@ def _verdict(home: CellAxis | None, axis: CellAxis | None, node: FoundNode | Non
         return "no identity"
     if expected is not None and node.identity is not None and (differing := expected.differences(node.identity)):
         return f"other {differing[0].partition(' 1018h')[0]}"
-    return "profile does not fit" if misfit else "ok"
+    unfit = "profile incomplete" if axis.profile is None else "profile does not fit"
+    return unfit if misfit else "ok"
 
 
 OTHER_DRIVE = (
@@ -510,7 +522,7 @@ def _notice_text(notice: Notice) -> Text:
     return Text(printable(f"{where}{notice.text}{remedy}"), "yellow" if notice.alarm else "")
 
 
-def current_signals(cell: Cell) -> dict[str, str]:
+def current_signals(cell: Wired) -> dict[str, str]:
     """Recorded current of each axis with an amplifier, such as "current reference 6074h:00, rms"."""
     return {
         axis.name: f"{axis.profile.signal}, amplitude {axis.profile.amplitude.value}"

@@ -76,6 +76,9 @@ class HistoryPoint(Report):
     """whether new moves confirm the gains of this calibration; left out where none were made"""
     accepted_at: str | None = None
     accepted_by: str | None = None
+    misdated: str | None = None
+    """`created` by the clock of that day, where the order of the audit log shows that it was wrong: `recorded` and
+    `created` are then what that order allows; left out where it was right"""
 
 
 class HistoryAxis(Report):
@@ -172,9 +175,21 @@ def show_history(
         console.print("To enter one: drivegain history CELL --add CALIBRATION")
         return
     console.print(calibration_table(entries, all_series, actions))
+    for entry in entries:
+        if entry.created_by_clock is not None:
+            console.print(_misdated_text(entry), style="yellow")
     console.print()
     console.print(history_gain_table(all_series))
     say_alarms(all_series, console)
+
+
+def _misdated_text(entry: Entry) -> str:
+    """Say that a calibration was entered while the clock was wrong."""
+    return (
+        f"Calibration {entry.digest[:12]}…: found the date {entry.created_by_clock:%Y-%m-%d}; expected one about "
+        f"{entry.created:%Y-%m-%d}, by the order of the audit log. The clock was wrong then, so it is shown there. The "
+        "files keep their dates; gates judge the age of its logs by them."
+    )
 
 
 def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
@@ -478,6 +493,8 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
     if point.entry.events:
         last = point.entry.events[-1]
         known |= {"applied_at": last.at, "applied_by": last.who, "applied_to": last.target}
+    if point.entry.created_by_clock is not None:
+        known["misdated"] = point.entry.created_by_clock
     acceptance = point.entry.acceptance
     if acceptance is not None:
         known["accepted"] = acceptance.accepted

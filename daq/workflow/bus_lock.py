@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
-from daq.config.cell import Bus, Cell
+from daq.config.cell import Bus, Wired
 from daq.errors import BusTaken, OutputFailed
 from daq.files import hold_lock
 from drivers.canopen.bus import BusAddress
@@ -28,7 +28,7 @@ SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 
 
 @contextmanager
-def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
+def bus_lock(cell: Wired, folder: Path | None = None) -> Iterator[None]:
     """Keep all buses of a cell for oneself.
 
     Args:
@@ -58,7 +58,7 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
         yield
 
 
-def bus_taken(cell: Cell, folder: Path | None = None, locks: Path = Path("/proc/locks")) -> bool:
+def bus_taken(cell: Wired, folder: Path | None = None, locks: Path = Path("/proc/locks")) -> bool:
     """Whether another program of this computer has a bus of the cell; the lock itself is not touched."""
     return bool(taken_of(cell.buses, folder, locks))
 

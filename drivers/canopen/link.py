@@ -366,6 +366,10 @@ class Link:
             values = f"{first[4:].hex(' ')} and {second[4:].hex(' ')}"
             self.twice.setdefault(node_id, f"two answers to one request for {entry} ({values})")
 
+    def booted_since(self, node_id: int, since_ns: int) -> bool:
+        """Whether the last that a node sent of its NMT state since then is its boot-up message."""
+        return self.nmt.get(node_id) == NmtState.BOOT_UP and self.heard_ns[node_id] >= since_ns
+
     def count_beats(self, node_id: int) -> None:
         """Forget the heartbeats of a node: its period has changed, or it has booted."""
         self._beats.pop(node_id, None)

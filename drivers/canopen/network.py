@@ -16,7 +16,15 @@ from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_ident
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
 from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy
-from drivers.canopen.setup import AxisSetup, HeartbeatGuard, Profiles, producer_of, read_consumers
+from drivers.canopen.setup import (
+    AxisSetup,
+    HeartbeatGuard,
+    Profiles,
+    producer_of,
+    read_consumers,
+    refusal,
+    why_no_heartbeat,
+)
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
 from drivers.errors import (
     POWERED,
@@ -221,7 +229,7 @@ class CanopenNetwork:
         answered = answering(self.link, self.node_ids, self.bounds.answer_s)
         if missing := [axis for axis in self.axes if axis.node_id not in answered]:
             raise NodeMissing(missing, answered, self.bounds.answer_s)
-        with self._second_device_named():
+        with self._second_device_named(), self._refusals_named():
             identities = tuple(read_identity(self.objects(axis)) for axis in self.axes)
         self._require_own_ids(0)
         for axis, found in zip(self.axes, identities, strict=True):
@@ -243,6 +251,17 @@ class CanopenNetwork:
             self._require_own_ids(0)
             raise
 
+    @contextmanager
+    def _refusals_named(self) -> Iterator[None]:
+        """Say of an object that an axis refuses while it is set up what it is for."""
+        try:
+            yield
+        except ObjectAccessError as error:
+            axis = next((axis for axis in self.axes if axis.node_id == error.node_id), None)
+            if error.abort_code is None or axis is None:
+                raise
+            raise refusal(error, axis) from error
+
     def _require_own_ids(self, period_ms: int) -> None:
         """Refuse an axis whose node id another device has too; `period_ms` is that of its heartbeat, 0 if unknown."""
         for axis in self.axes:
@@ -263,7 +282,7 @@ class CanopenNetwork:
             NodeMissing, SetupRefused, StateRefused, ObjectAccessError, BusError: see drivers/errors.py.
         """
         self.require_quiet()
-        with self._second_device_named():
+        with self._second_device_named(), self._refusals_named():
             self._set_up()
 
     def _set_up(self) -> None:
@@ -282,6 +301,7 @@ class CanopenNetwork:
         self._setups.update(new)
         for setup in self._setups.values():
             setup.send_heartbeats(self.heartbeat_ms)
+            setup.expect_plain_sync()
             setup.guard.arm(self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
         for axis in self.axes:
@@ -411,7 +431,13 @@ class CanopenNetwork:
         since = {node_id: self.link.command_nmt(node_id, command) for node_id in self.node_ids}
         for node_id, since_ns in since.items():
             waited_s = (self.link.clock() - since_ns) * 1e-9
-            self.link.confirm_nmt(node_id, state, since_ns, max(self.bounds.nmt_s - waited_s, 0.0))
+            try:
+                self.link.confirm_nmt(node_id, state, since_ns, max(self.bounds.nmt_s - waited_s, 0.0))
+            except StateRefused as refused:
+                access = self.link.objects(node_id)
+                if node_id in self.link.nmt:
+                    raise
+                raise StateRefused(access, refused.asked, refused.found, remedy=why_no_heartbeat(access)) from refused
 
     def ampere_per_unit(self) -> tuple[float, ...]:
         """Return ampere per raw unit of each axis' current object, from the drives' own scale objects.
@@ -527,7 +553,7 @@ class CanopenNetwork:
         left: dict[str, tuple[str, ...]] = {}
         for axis in axes:
             left_s = max(self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9, 0.0)
-            if self.link.allowed_s(left_s) > 0.0:
+            if self._setups[axis.node_id].beats and self.link.allowed_s(left_s) > 0.0:
                 with _collected(problems):
                     self.link.confirm_nmt(axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, left_s)
             left[axis.name] = self._setups[axis.node_id].restore(problems)

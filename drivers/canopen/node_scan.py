@@ -135,11 +135,26 @@ def read_identity(access: ObjectAccess) -> Identity:
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Return the nodes that answer an SDO request; all are asked at once, and share the time."""
+    """Return the nodes that answer an SDO request; all are asked at once, and share the time.
+
+    One that sends its boot-up message meanwhile is asked again: it was still booting when it was asked.
+    """
     asked = set(node_ids)
     link.answered.clear()
+    began_ns = link.clock()
+    again: set[int] = set()
+
+    def booted() -> list[int]:
+        return [n for n in sorted(asked - again - link.answered.keys()) if link.booted_since(n, began_ns)]
+
     _ask(link, node_ids)
-    link.wait(wait_s, lambda: asked <= link.answered.keys())
+    end_ns = began_ns + round(wait_s * 1e9)
+    while link.wait((end_ns - link.clock()) * 1e-9, lambda: asked <= link.answered.keys() or bool(booted())):
+        up = booted()
+        if not up:
+            break
+        again.update(up)
+        _ask(link, up)
     return tuple(sorted(asked & link.answered.keys()))
 
 

@@ -15,7 +15,7 @@ fault. The watch raises ObjectAccessError only when the amplifier does not answe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 
@@ -50,10 +50,20 @@ MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
 CONSUMERS = ObjectEntry(0x1016, 0, 8)
+SUPPORTED_MODES = ObjectEntry(0x6502, 0, 32)
+SYNC_COUNTER = ObjectEntry(0x1019, 0, 8)
+GUARD_TIME = ObjectEntry(0x100C, 0, 16)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
 SMALL_PDO_BYTES = 6  #: Tried where a drive refuses PDOs of eight bytes
 MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
+
+HEARTBEATS_NEEDED = (
+    "its NMT state and its loss would not be known without heartbeats, and node guarding (100Ch) is not supported: use "
+    "a firmware of the drive that has heartbeats"
+)
+
+MODE_REMEDY = "is another controller, a fault or a switch of the drive in the way? choose the mode with its own tool"
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
@@ -104,6 +114,47 @@ def needs_of(profile: DriveProfile) -> dict[ObjectEntry, str]:
     }
 
 
+_PDO_PARAMETERS = {
+    range(0x1400, 0x1600): "parameters of RPDO",
+    range(0x1600, 0x1800): "mapping of RPDO",
+    range(0x1800, 0x1A00): "parameters of TPDO",
+    range(0x1A00, 0x1C00): "mapping of TPDO",
+}
+_PURPOSES = {
+    0x1016: "watch over the recorder",
+    0x1018: "identity",
+    ABORT_CONNECTION.index: "stop when the recorder is lost",
+    PROFILE_DECELERATION.index: "profile deceleration",
+}
+
+
+def purpose_of(entry: str, profile: DriveProfile) -> str:
+    """Say what a recording needs an object for, as `ObjectAccessError.entry` names it; empty for one of no purpose."""
+    for needed, purpose in needs_of(profile).items():
+        if str(needed) == entry:
+            return purpose
+    try:
+        index = int(entry[:4], 16)
+    except ValueError:
+        return ""
+    for indices, purpose in _PDO_PARAMETERS.items():
+        if index in indices:
+            return f"{purpose}{index - indices.start + 1}"
+    return _PURPOSES.get(index, "")
+
+
+def refusal(error: ObjectAccessError, axis: Axis) -> SetupRefused:
+    """Return the error of an object without which a drive cannot be set up, with what it is for and what to do."""
+    purpose = purpose_of(error.entry, axis.profile)
+    what = f" ({purpose})" if purpose else ""
+    return SetupRefused(
+        axis,
+        f"found object {error.entry}{what} refused: {error.reason}; expected an answer, as from the other objects that "
+        "a recording needs; nothing has moved: is the drive being set up or updated by another tool, or in a state "
+        "that locks its objects? switch it off and on, then try again",
+    )
+
+
 def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> str:
     """Describe the objects of a profile that a drive does not have, and name a profile that fits; empty if it has all.
 
@@ -113,6 +164,8 @@ def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple
     lacking = _lacking(access, profile)
     if not lacking:
         return ""
+    if any(str(HEARTBEAT_TIME) in one for one in lacking):
+        return f"found {', '.join(lacking)}; expected every object of profile {profile.name}; {HEARTBEATS_NEEDED}"
     fitting = [other for other in others() if other.name != profile.name and not _lacking(access, other)]
     if fitting:
         advice = " or ".join(f"`{other.name}` ({_difference(other, profile)})" for other in fitting)
@@ -120,6 +173,20 @@ def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple
     else:
         remedy = "no shipped profile fits this drive: write one with the objects of its manual"
     return f"found {', '.join(lacking)}; expected every object of profile {profile.name}; {remedy}"
+
+
+def why_no_heartbeat(access: ObjectAccess) -> str:
+    """Say why a drive may send no heartbeat, by its objects, and what to do.
+
+    Raises:
+        ObjectAccessError: the drive does not answer.
+    """
+    period_ms = access.read_optional(HEARTBEAT_TIME, any_abort=True)
+    found = f"it answers SDO and sends no heartbeat (1017h = {'none' if period_ms is None else period_ms})"
+    guard_ms = access.read_optional(GUARD_TIME, any_abort=True)
+    if guard_ms is not None:
+        found += f", and has node guarding (100Ch = {guard_ms})"
+    return f"{found}; {HEARTBEATS_NEEDED}, or switch node guarding off in it"
 
 
 def _lacking(access: ObjectAccess, profile: DriveProfile) -> tuple[str, ...]:
@@ -225,12 +292,16 @@ class AxisSetup:
         self._link = link
         self._axis = axis
         self._access = link.objects(axis.node_id)
-        self._heartbeat_ms: int | None = None
-        self._mode: int | None = None
+        self._before: dict[ObjectEntry, int] = {}  # single settings that were changed
         self.pdos = AxisPdos((), ())  #: As they are mapped
         self._absent: tuple[ObjectEntry, ...] = ()
         self._found: dict[Direction, tuple[PdoRecord, ...]] = {}
         self._pdos_before: dict[str, PdoRecord] = {}
+
+    @property
+    def beats(self) -> bool:
+        """Whether the amplifier was asked for heartbeats, which confirm its NMT state."""
+        return HEARTBEAT_TIME in self._before
 
     def check(self, profiles: Profiles) -> None:
         """Check, before anything is written, that the drive has the objects and the PDOs that its profile needs.
@@ -258,11 +329,59 @@ class AxisSetup:
             raise SetupRefused(self._axis, f"PDO: profile {self._axis.profile.name}: {error}") from error
 
     def send_heartbeats(self, period_ms: int) -> None:
-        """Let the amplifier send heartbeats."""
-        if self._heartbeat_ms is None:
-            self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
-        self._access.write(HEARTBEAT_TIME, period_ms)
+        """Let the amplifier send heartbeats.
+
+        Raises:
+            SetupRefused: it refuses the period.
+            ObjectAccessError: it does not answer.
+        """
+        self._change(HEARTBEAT_TIME, period_ms, f"heartbeats of {period_ms} ms", HEARTBEATS_NEEDED)
         self._link.count_beats(self._axis.node_id)
+
+    def expect_plain_sync(self) -> None:
+        """Let the amplifier answer SYNC without a counter, as it is sent.
+
+        Raises:
+            SetupRefused: it goes on waiting for a counter.
+            ObjectAccessError: it does not answer.
+        """
+        counter = self._access.read_optional(SYNC_COUNTER, any_abort=True)
+        if counter:
+            remedy = f"it waits for SYNC with a counter (1019h = {counter}): set it to 0 with the drive's own tool"
+            self._change(SYNC_COUNTER, 0, "SYNC without a counter, 0", remedy)
+
+    def _read(self, entry: ObjectEntry, expected: str, remedy: str) -> int:
+        with self._named(entry, "reading", expected, remedy):
+            return self._access.read(entry)
+
+    def _change(self, entry: ObjectEntry, value: int, expected: str, remedy: str) -> None:
+        """Write a setting whose value before is restored at the end."""
+        is_first = entry not in self._before
+        if is_first:
+            self._before[entry] = self._read(entry, expected, remedy)
+        try:
+            with self._named(entry, "writing", expected, remedy):
+                self._access.write(entry, value)
+        except SetupRefused:
+            if is_first:
+                del self._before[entry]  # it was not changed; without an answer, it may have been
+            raise
+
+    @contextmanager
+    def _named(self, entry: ObjectEntry, action: str, expected: str, remedy: str) -> Iterator[None]:
+        """Say of an object that the drive refuses what it is for, and what to do.
+
+        Raises:
+            SetupRefused: the drive refuses it.
+            ObjectAccessError: the drive does not answer.
+        """
+        try:
+            yield
+        except ObjectAccessError as error:
+            if error.abort_code is None:
+                raise
+            found = f"{action} {entry} is refused ({error.reason})"
+            raise SetupRefused(self._axis, f"found {found}; expected {expected}; {remedy}") from error
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
@@ -308,17 +427,32 @@ class AxisSetup:
         return pdos
 
     def set_mode(self, within_s: float) -> None:
-        """Select profile position mode, and wait until 6061h shows it; StateRefused where it does not in time."""
+        """Select profile position mode, and wait until 6061h shows it.
+
+        Raises:
+            SetupRefused: the amplifier refuses the mode, or does not show it.
+            StateRefused: 6061h does not show it in time.
+            ObjectAccessError: the amplifier does not answer.
+        """
         access = self._access
-        if self._mode is None:
-            self._mode = access.read(MODE_OF_OPERATION)
-        access.write(MODE_OF_OPERATION, PROFILE_POSITION_MODE)
+        expected = "profile position mode (1), in which the drive makes the moves by itself"
+        self._change(MODE_OF_OPERATION, PROFILE_POSITION_MODE, expected, self._mode_remedy())
         deadline = self._link.clock() + round(within_s * 1e9)
-        while (shown := access.read(MODE_DISPLAY)) != PROFILE_POSITION_MODE:
+        while True:
+            shown = self._read(MODE_DISPLAY, expected, MODE_REMEDY)
+            if shown == PROFILE_POSITION_MODE:
+                return
             if self._link.clock() >= deadline:
                 found = f"mode {shown} in 6061h"
                 raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
             self._link.pass_time()
+
+    def _mode_remedy(self) -> str:
+        """Say what to do where the mode is refused, by the modes that the drive reports (6502h; bit 0: this one)."""
+        supported = self._access.read_optional(SUPPORTED_MODES, any_abort=True)
+        if supported is None or supported & 1:
+            return MODE_REMEDY
+        return f"the drive does not have it (6502h = {supported:#x}, bit 0 is 0): this firmware cannot be recorded"
 
     def restore(self, problems: list[DriverError]) -> tuple[str, ...]:
         """Restore all settings; returns the names of those that are left when the amplifier falls silent.
@@ -345,11 +479,12 @@ class AxisSetup:
         """Yield the steps that restore all settings, and their names; the heartbeat last."""
         for record in self._pdos_before.values():
             yield record.name, partial(write_pdo_record, self._access, record)
-        if self._mode is not None:
-            yield "6060h", partial(self._access.write, MODE_OF_OPERATION, self._mode)
+        for entry in (SYNC_COUNTER, MODE_OF_OPERATION):
+            if entry in self._before:
+                yield f"{entry.index:04X}h", partial(self._access.write, entry, self._before[entry])
         yield "1016h", self.guard.disarm
-        if self._heartbeat_ms is not None:
-            yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
+        if HEARTBEAT_TIME in self._before:
+            yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._before[HEARTBEAT_TIME])
 
     def describe(self, identity: Identity, scale: ScaleReading, silence_ms: int) -> dict[str, object]:
         """Return what the drive reported during the setup, for the log."""
@@ -368,7 +503,7 @@ class AxisSetup:
             "rated_torque_nm": scale.rated_torque_nm,
             "scale_warnings": list(scale.warnings),
             "guard": self.guard.describe(silence_ms),
-            "mode_before": self._mode,
+            "mode_before": self._before.get(MODE_OF_OPERATION),
             "mapping": [str(record) for record in self.pdos.feedback + self.pdos.setpoints],
             "mapping_before": [str(record) for record in self._pdos_before.values()],
         }

@@ -47,6 +47,7 @@ from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
 
+_URGENT_CYCLES = 10  #: In which a controlword is sent with every SYNC; then with every tenth
 _NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
@@ -225,6 +226,9 @@ class _Execution:
             ramps = {PROFILE_ACCELERATION: acceleration, PROFILE_DECELERATION: acceleration}
             self._send(axis, {PROFILE_VELOCITY: velocity, **ramps})
             yield self._checked()
+        held = yield from self._release(moving)
+        if held:
+            raise self._timeout(number, held, self._bounds.acknowledge_s, acknowledge=0)
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
             self._send_command(axis, _NEW_SETPOINT)
@@ -246,33 +250,60 @@ class _Execution:
                     error = DriveFault(self._nodes[axis], reason, remedy=remedy)
                     self._bus.report(axis, EventKind.FROZEN, number, str(error))
                     raise error
-            if self._sample.cycle >= end and all(self._arrived(axis, start[axis]) for axis in moving):
+            arrived = all(self._arrived(axis, start[axis]) for axis in moving)
+            if self._sample.cycle >= end and arrived and not self._held(moving):
                 break
             yield self._checked()
         else:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
                 raise self._timeout(number, late, allowed_s)
+            held = self._held(moving)
+            if held:
+                raise self._timeout(number, held, allowed_s, acknowledge=0)
         self._bus.report(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
-        """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
-        bit = STATUS_SETPOINT_ACKNOWLEDGE
-        for wanted, controlword in ((bit, _NEW_SETPOINT), (0, int(ControlCommand.ENABLE_OPERATION))):
-            waiting = list(moving)
-            for _ in range(self._cycles(self._bounds.acknowledge_s)):
-                for axis in waiting:
-                    # Repeated every cycle until acknowledged: some drives act on the second controlword only.
-                    self._send_command(axis, controlword, repeat=True)
-                if not waiting:
-                    break
-                yield self._checked()
-                waiting = [axis for axis in moving if self._sample.statusword[axis] & bit != wanted]
-            if waiting:
-                acknowledge = int(bool(wanted))
-                raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s, acknowledge)
+        """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements.
+
+        A drive without a buffer holds its acknowledgement until it has arrived; the move waits for that at its end.
+        """
+        waiting = tuple(moving)
+        for _ in range(self._cycles(self._bounds.acknowledge_s)):
+            for axis in waiting:
+                # Repeated every cycle until acknowledged: some drives act on the second controlword only.
+                self._send_command(axis, _NEW_SETPOINT, repeat=True)
+            if not waiting:
+                break
+            yield self._checked()
+            held = self._held(moving)
+            waiting = tuple(axis for axis in moving if axis not in held)
+        if waiting:
+            raise self._timeout(number, waiting, self._bounds.acknowledge_s, acknowledge=1)
+        for axis in moving:
+            self._send_command(axis, int(ControlCommand.ENABLE_OPERATION), repeat=True)
+        yield self._checked()
+        yield from self._release(moving)
+
+    def _release(self, moving: Sequence[int]) -> Generator[Sample, None, tuple[int, ...]]:
+        """Clear the new set-point until no axis holds its acknowledgement; return those that still do in the end."""
+        held = self._held(moving)
+        for cycle in range(self._cycles(self._bounds.acknowledge_s)):
+            if not held:
+                break
+            for axis in held:
+                # Less often after a while: where it is held until the drive has arrived, the bus has other work.
+                is_due = cycle < _URGENT_CYCLES or cycle % _URGENT_CYCLES == 0
+                self._send_command(axis, int(ControlCommand.ENABLE_OPERATION), repeat=is_due)
+            yield self._checked()
+            held = self._held(moving)
+        return held
+
+    def _held(self, axes: Sequence[int]) -> tuple[int, ...]:
+        """Return the axes that acknowledge a set-point now."""
+        return tuple(axis for axis in axes if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE)
 
     def _timeout(
         self, number: int, late: tuple[int, ...], waited_s: float, acknowledge: int | None = None

@@ -3,6 +3,10 @@
 Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is refused to its sender
 and reaches no client. The server listens on the loopback interface alone. A client that does not read is disconnected
 when ``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its next call fails.
+
+The first client of a channel is the cell that the hub was started for, and is never disconnected. While it has more to
+read than ``FULL_BYTES``, the others are not read: they cannot send faster than it lives, as on a wire. Neither is a
+client that does not read the hub's own answers.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from drivers.errors import BusError
 
 HOST = "127.0.0.1"
 BACKLOG_BYTES = 8 << 20
+FULL_BYTES = 64 << 10  #: About 1500 frames, 50 ms of a simulated cell
 # Possessive: each byte is read a bounded number of times, so that no line takes long.
 _COMMAND = re.compile(rb"<\s*+(?:send ([0-9A-Fa-f]++) ([0-9A-Fa-f]++)([0-9A-Fa-f ]*+)|([^<>]*+))>")
 _MAX_COMMAND_BYTES = 256
@@ -43,6 +48,7 @@ class Hub:
     def __init__(self, channels: tuple[str, ...], port: int = 0) -> None:
         self.channels = channels
         self.clients: set[_Client] = set()
+        self.cells: dict[str, _Client] = {}  #: the first client of each channel
         self._port = port
         self._server: asyncio.Server | None = None
 
@@ -87,25 +93,73 @@ class _Client(asyncio.Protocol):
         self._channel: str | None = None
         self._raw = False
         self._incoming = b""
+        self._full = False  # more waits for it than FULL_BYTES
+        self._answered = False  # some of that may be answers of the hub itself
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
+        self._transport.set_write_buffer_limits(high=FULL_BYTES)
         self._hub.clients.add(self)
         self._write(b"< hi >")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._hub.clients.discard(self)
+        self._forget()
 
     def drop(self) -> None:
-        self._hub.clients.discard(self)
+        self._forget()
         self._transport.abort()
 
+    def _forget(self) -> None:
+        self._hub.clients.discard(self)
+        if self._is_cell:
+            del self._hub.cells[cast(str, self._channel)]
+            self._throttle_others()
+
+    @property
+    def _is_cell(self) -> bool:
+        return self._channel is not None and self._hub.cells.get(self._channel) is self
+
+    def pause_writing(self) -> None:
+        self._full = True
+        self._throttle()
+        if self._is_cell:
+            self._throttle_others()
+
+    def resume_writing(self) -> None:
+        self._full = False
+        self._throttle()
+        if self._is_cell:
+            self._throttle_others()
+
+    def _throttle_others(self) -> None:
+        for other in self._hub.clients:
+            if other is not self and other._channel == self._channel:
+                other._throttle()
+
+    def _throttle(self) -> None:
+        """Read this client only while there is room for what it sends."""
+        cell = None if self._channel is None else self._hub.cells.get(self._channel)
+        waits_for_cell = cell is not None and cell is not self and cell._full
+        if waits_for_cell or (self._full and self._answered):
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
+
     def _write(self, data: bytes) -> None:
+        if self._transport.is_closing():
+            return  # asyncio would print a warning for each
         self._transport.write(data)
-        if self._transport.get_write_buffer_size() > BACKLOG_BYTES:
+        if not self._is_cell and self._transport.get_write_buffer_size() > BACKLOG_BYTES:
             self.drop()
 
+    def _say(self, answer: bytes) -> None:
+        """Write an answer of the hub itself."""
+        self._answered = True
+        self._write(answer)
+
     def data_received(self, data: bytes) -> None:
+        if not self._full:
+            self._answered = False
         buffer = self._incoming + data
         end = 0
         frames = []
@@ -118,7 +172,7 @@ class _Client(asyncio.Protocol):
             elif len(match[0]) <= _MAX_COMMAND_BYTES and (frame := _frame(identifier, int(length, 16), payload, stamp)):
                 frames.append(frame)
             else:
-                self._write(b"< error malformed frame >")
+                self._say(b"< error malformed frame >")
         self._incoming = buffer[end:]
         if len(self._incoming) > _MAX_COMMAND_BYTES:
             self.drop()  # this is not the socketcand protocol
@@ -127,23 +181,27 @@ class _Client(asyncio.Protocol):
             for other in tuple(self._hub.clients):
                 if other is not self and other._raw and other._channel == self._channel:
                     other._write(burst)
+        self._throttle()
 
     def _answer(self, command: bytes | None) -> None:
         words = b"send" if command is None else command[:_MAX_COMMAND_BYTES]
         word, _, argument = words.decode("ascii", "replace").strip().partition(" ")
-        if word == "open" and argument in self._hub.channels:
+        if word == "open" and self._raw:
+            self._say(b"< error a bus is open >")
+        elif word == "open" and argument in self._hub.channels:
             self._channel = argument
-            self._write(b"< ok >")
+            self._say(b"< ok >")
         elif word == "open":
             known = ", ".join(self._hub.channels)
-            self._write(f"< error no bus {argument}, there is {known} >".encode("ascii", "replace"))
+            self._say(f"< error no bus {argument}, there is {known} >".encode("ascii", "replace"))
         elif word == "rawmode" and self._channel is not None:
             self._raw = True
-            self._write(b"< ok >")
+            self._hub.cells.setdefault(self._channel, self)
+            self._say(b"< ok >")
         elif word == "echo":
-            self._write(b"< echo >")
+            self._say(b"< echo >")
         else:
-            self._write(b"< error unknown command >")
+            self._say(b"< error unknown command >")
 
 
 def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> bytes | None:

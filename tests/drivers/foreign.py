@@ -123,7 +123,7 @@ class ForeignNode(ScriptedNode):
         super().control(word, cycle)
         self.target = self.target - (1 << 32) if self.target >= 1 << 31 else self.target
 
-    def on_sync(self, cycle: int) -> list[can.Message]:
+    def on_sync(self, cycle: int, counted: bool = False) -> list[can.Message]:
         if self.nmt != 5:
             return []
         answers = []

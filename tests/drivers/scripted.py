@@ -52,12 +52,14 @@ class ScriptedNode:
 
     Attributes:
         objects: value and size [bytes] by (index, subindex).
-        aborts: abort code of a write, by (index, subindex).
+        aborts: abort code of a write, by (index, subindex); `read_aborts`: of a read.
         lies: value that a read returns instead of the stored one.
         obeys_nmt: whether it follows NMT commands.
         quick_stop_stays: it stays in QUICK STOP ACTIVE (605Ah = 5).
         ignores_setpoint: it never acknowledges one.
         second_controlword: it acknowledges a set-point only when it is said twice.
+        holds_acknowledge: it keeps bit 12 until it has arrived; `keeps_acknowledge`: for ever.
+        acts_at_once: RPDOs act when they arrive, not with the next SYNC.
     """
 
     def __init__(self, node_id: int, serial: int = 7) -> None:
@@ -69,9 +71,11 @@ class ScriptedNode:
         self.target = 0
         self.moving = False
         self.aborts: dict[tuple[int, int], int] = {}
+        self.read_aborts: dict[tuple[int, int], int] = {}
         self.lies: dict[tuple[int, int], int] = {}
         self.obeys_nmt = self.beats = True
         self.quick_stop_stays = self.ignores_setpoint = self.second_controlword = False
+        self.holds_acknowledge = self.keeps_acknowledge = self.acts_at_once = False
         self.largest_pdo_bits = 64
         self.powered_cycles = 0
         self.setpoint_cycles: list[int] = []
@@ -125,6 +129,8 @@ class ScriptedNode:
         if not self.has(index, sub):
             return struct.pack("<BHBL", 0x80, index, sub, 0x06020000)
         _, size = self.objects[index, sub]
+        if command == 0x40 and (index, sub) in self.read_aborts:
+            return struct.pack("<BHBL", 0x80, index, sub, self.read_aborts[index, sub])
         if command == 0x40:
             self._refresh()
             value = self.lies.get((index, sub), self.value(index, sub))
@@ -166,10 +172,14 @@ class ScriptedNode:
     def receive_pdo(self, cob_id: int, data: bytes) -> None:
         if self.nmt == 5:
             self._pending[cob_id] = data
+        if self.acts_at_once:
+            self._apply_pdos(0)
 
-    def on_sync(self, cycle: int) -> list[can.Message]:
+    def on_sync(self, cycle: int, counted: bool = False) -> list[can.Message]:
         if self.nmt != 5:
             return []
+        if self.has(0x1019, 0) and self.value(0x1019, 0) and not counted:
+            return [self.emcy(0x8240)]  # CiA 301: unexpected SYNC data length
         answers = []
         for number in range(4):
             cob, kind = self.value(0x1800 + number, 1), self.value(0x1800 + number, 2)
@@ -180,6 +190,11 @@ class ScriptedNode:
                     for i, s, n in self._mapped(0x1800, number)
                 )
                 answers.append(can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data))
+        self._apply_pdos(cycle)
+        self._move()
+        return answers
+
+    def _apply_pdos(self, cycle: int) -> None:
         for number in range(4):
             cob = self.value(0x1400 + number, 1)
             pdo = self._pending.pop(cob & 0x7FF, None)
@@ -191,8 +206,6 @@ class ScriptedNode:
                 offset += size
             if number == 0:
                 self.control(self.value(0x6040, 0), cycle)
-        self._move()
-        return answers
 
     def control(self, word: int, cycle: int) -> None:
         state, upper = self.statusword & 0x6F, self.statusword & ~0x6F
@@ -216,7 +229,8 @@ class ScriptedNode:
             self.moving = False
             return
         if not word & 0x10:
-            self.statusword &= ~0x1000
+            if not self.keeps_acknowledge and not (self.holds_acknowledge and self.moving):
+                self.statusword &= ~0x1000
             self._rising_seen = 0
             return
         self._rising_seen += 1
@@ -238,6 +252,8 @@ class ScriptedNode:
             if self.position == self.target:
                 self.moving = False
                 self.statusword |= 0x0400
+                if self.holds_acknowledge and not self._previous_control & 0x10:
+                    self.statusword &= ~0x1000
 
     def fault(self, following_error: bool = False) -> None:
         self.statusword = self.statusword & ~0x6F | 0x08 | (0x2000 if following_error else 0)
@@ -289,7 +305,7 @@ class ScriptedBus(can.BusABC):
             self.on_cycle(self.cycle)
         for node in self.nodes:
             if cob == 0x80:
-                for answer in node.on_sync(self.cycle):
+                for answer in node.on_sync(self.cycle, bool(data)):
                     self._answer(answer)
             elif cob == 0 and data[1] in (0, node.node_id) and node.obeys_nmt:
                 node.nmt = {1: 5, 2: 4, 128: 127}[data[0]]
@@ -303,7 +319,7 @@ class ScriptedBus(can.BusABC):
 
     def _beat(self) -> None:
         for node in self.nodes:
-            period_ms = node.value(0x1017, 0)
+            period_ms = node.value(0x1017, 0) if node.has(0x1017, 0) else 0
             if node.beats and period_ms and self.clock.now_ns >= node.next_beat_ns:
                 node.next_beat_ns = self.clock.now_ns + period_ms * 1_000_000
                 data = bytes((node.nmt,))

@@ -24,7 +24,7 @@ from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.hub import Hub
-from drivers.simulation.spec import CellSpec, SpecInvalid
+from drivers.simulation.spec import CellSpec, SdoAbort, SpecInvalid
 from tests.daq.console.feeds import arrivals
 from tests.faults.cells import CONFIGS
 
@@ -102,9 +102,77 @@ def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_co
     failure = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert failure["kind"] == "SetupRefused"
     assert failure["found"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002")
-    assert failure["expected"]
+    assert failure["expected"] == "a PDO that can be mapped for the recording"
+    assert "switch the drive off and on" in failure["do"]
+    told = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
+    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=told)
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def refuse(monkeypatch: pytest.MonkeyPatch, cell: SimulatedCell, action: str, index: int, sub: int) -> None:
+    """Let J2 abort each reading or writing of an object."""
+    server = cell.nodes[1]._sdo
+    sound = getattr(server, action)
+
+    def aborting(asked: int, asked_sub: int, *value: bytes) -> object:
+        if (asked, asked_sub) == (index, sub):
+            raise SdoAbort(0x08000022)
+        return sound(asked, asked_sub, *value)
+
+    monkeypatch.setattr(server, action, aborting)
+
+
+REFUSED_OBJECTS = [
+    ("_read", 0x1018, 1, "identity"),
+    ("_read", 0x1017, 0, "heartbeats of 100 ms"),
+    ("_write", 0x1017, 0, "heartbeats of 100 ms"),
+    ("_read", 0x1800, 1, "parameters of TPDO1"),
+    ("_read", 0x1A00, 0, "mapping of TPDO1"),
+    ("_read", 0x1400, 2, "parameters of RPDO1"),
+    ("_write", 0x1800, 1, "a PDO that can be mapped"),
+    ("_write", 0x1A00, 1, "a PDO that can be mapped"),
+    ("_write", 0x1400, 1, "a PDO that can be mapped"),
+    ("_write", 0x1600, 0, "a PDO that can be mapped"),
+    ("_read", 0x6041, 0, "statusword"),
+    ("_read", 0x6060, 0, "profile position mode (1)"),
+    ("_write", 0x6060, 0, "profile position mode (1)"),
+    ("_read", 0x6061, 0, "profile position mode (1)"),
+    ("_read", 0x6075, 0, "scale of the current"),
+]
+"""Objects of each step of the set-up, and what the message says of them; tests/drivers has every object."""
+
+
+@pytest.mark.parametrize(
+    ("action", "index", "sub", "said"),
+    REFUSED_OBJECTS,
+    ids=lambda part: f"{part:04X}" if isinstance(part, int) else part,
+)
+def test_an_abort_at_each_step_of_the_setup_is_exit_5_with_its_reason_and_consoles_get_it(
+    action: str,
+    index: int,
+    sub: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
+    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    plan.write_text(PLAN, encoding="utf-8")
+    spec = load_simulation(shipped_simulation("clean"))
+    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
+        refuse(monkeypatch, cell, action, index, sub)
+        command = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--json"]
+        assert main(command) == ExitCode.DEVICE_FAULT
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
+    assert failure["kind"] == "SetupRefused"
+    assert failure["found"].startswith("J2 (node 2): ")
+    assert f"{index:04X}h:{sub:02X}" in failure["found"]
+    assert said in failure["found"] + failure["expected"]
     assert failure["do"]
-    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=failure["found"])
+    told = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
+    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=told)
     assert not list(tmp_path.glob("*.mcap*"))
 
 

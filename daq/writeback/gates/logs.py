@@ -146,7 +146,10 @@ def age(context: GateContext) -> Iterator[GateFinding]:
             remedy = "record again and fit"
         else:
             found = f"recorded {_span(-days)} from now"
-            remedy = "set the clocks of this computer and of the recorder"
+            remedy = (
+                "set the clocks of this computer and of the recorder; if a log was recorded under a wrong date, it "
+            )
+            remedy += "keeps that date: record again and fit"
         yield name, found, expected, remedy
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -301,6 +302,113 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     (warning,) = (text for text in document["warnings"] if text.startswith("J1: "))
     assert "near √2" in warning
     assert warning.split()[-1] in shown.out
+
+
+# -- a cell file that every other verb refuses -------------------------------------------------------------------------
+
+
+def scan_edited(
+    checkout: Path, cell: Cell, folder: Path, edit: Callable[[str], str], capsys: pytest.CaptureFixture[str]
+) -> tuple[dict[str, Any], str]:
+    """JSON and text of a scan of the demo cell with an edited file, all of whose drives are on the bus."""
+    configs = Path(shutil.copytree(checkout / "configs", folder / "configs"))
+    file = configs / "cells/demo.yaml"
+    before = file.read_text(encoding="utf-8")
+    edited = edit(before)
+    assert edited != before
+    file.write_text(edited, encoding="utf-8")
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus):
+        assert main(["scan", str(file), "--json"]) == ExitCode.OK
+        document = json.loads(capsys.readouterr().out)
+        assert main(["scan", str(file)]) == ExitCode.OK
+        shown = capsys.readouterr()
+    assert "Next" not in shown.err
+    return document, shown.out
+
+
+def test_a_profile_without_its_peak_current_costs_one_axis_its_check_and_no_drive_its_row(
+    checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def edit(text: str) -> str:
+        return text.replace("drive: generic-cia402", "drive: technosoft-ipos", 1)
+
+    document, shown = scan_edited(checkout, cell, tmp_path, edit, capsys)
+    rows = document["nodes"]
+    assert [row["serial"] for row in rows] == [1001, 1002, 1003, 1004, 1005, 1006]
+    assert [row["verdict"] for row in rows] == ["profile incomplete", *["ok"] * 5]
+    (remark,) = rows[0]["remarks"]
+    assert "current_scale.peak_current_a: found nothing; expected the peak current" in remark
+    assert document["cell_fault"] == ""
+    assert sorted(document["current"]) == ["J2", "J3", "J4", "J5", "J6"]
+    assert "J1 (node 1): " in shown
+    assert "copy the profile to drives/" in shown
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("velocity_deg_s: ", "velocity_deg_s: -", "limits.velocity_deg_s"),
+        ("counts_per_revolution: ", "counts_per_revolution: 0 # ", "counts_per_revolution"),
+        ("period_us: ", "period_us: 1 # ", "sync.period_us"),
+        ("mass_kg: ", "mass_kg: -", "mass_kg"),
+        ("urdf: ", "urdf: absent-", "absent-"),
+    ],
+)
+def test_a_wrong_number_elsewhere_keeps_no_drive_from_being_found(
+    checkout: Path,
+    cell: Cell,
+    tmp_path: Path,
+    before: str,
+    after: str,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    document, shown = scan_edited(checkout, cell, tmp_path, lambda text: text.replace(before, after, 1), capsys)
+    assert [row["verdict"] for row in document["nodes"]] == ["ok"] * 6
+    assert said in document["cell_fault"]
+    assert "every other command refuses the cell file" in shown
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "verdict"),
+    [
+        ("node_id: 6", "node_id: six", "not configured"),
+        ("node_id: 6", "node_id: 5", "not configured"),
+        ("node_id: 6", "node_id: 200", "not configured"),
+        ("serial: 1006", "serial: SN1006", "ok"),
+        ("drive: generic-cia402", "drive: 7", "profile incomplete"),
+        ("drive: generic-cia402", "drive: unknown-make", "profile incomplete"),
+    ],
+)
+def test_what_is_wrong_with_one_axis_costs_that_axis_alone(
+    checkout: Path,
+    cell: Cell,
+    tmp_path: Path,
+    before: str,
+    after: str,
+    verdict: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def edit(text: str) -> str:
+        head, mark, tail = text.rpartition(before)
+        return f"{head}{after}{tail}" if mark else text
+
+    document, _ = scan_edited(checkout, cell, tmp_path, edit, capsys)
+    assert [row["verdict"] for row in document["nodes"]] == ["ok"] * 5 + [verdict]
+    said = document["cell_fault"] + str(document["nodes"][5]["remarks"])
+    assert after.partition(": ")[2] in said
+
+
+def test_a_file_without_any_node_id_is_refused_as_before(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
+    file = configs / "cells/demo.yaml"
+    file.write_text(file.read_text().replace("node_id: ", "node: "))
+    assert main(["scan", str(file), "--json"]) == ExitCode.CONFIGURATION
+    failure = json.loads(capsys.readouterr().err)
+    assert failure["kind"] == "SchemaMismatch"
+    assert "did you mean that?" in failure["found"]
 
 
 # -- while another program uses the bus --------------------------------------------------------------------------------

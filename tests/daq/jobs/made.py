@@ -56,7 +56,8 @@ class Made:
             return replace(self.recorded[out.stem], path=out)
 
         def in_this_cell(_fit: Fit, created: datetime) -> Calibration:
-            session = rig.sessions[-1].folder
+            running = [one for one in rig.sessions if one.state.outcome is None]
+            session = running[-1].folder  # by its date, one of the future is later
             sources = tuple(
                 replace(
                     source,

@@ -318,14 +318,106 @@ def test_a_disk_that_is_full_is_reported_before_and_during_a_run(tmp_path: Path,
         assert powerless(cell)
 
 
-def test_a_clock_that_went_back_is_an_alarm(tmp_path: Path, made: Made) -> None:
+# Steps of the clock. Such a session held every later job with exit code 14 until its folder was moved, two years for a
+# date that was wrong once. Now it is said and does not count: what holds jobs must be what would harm, and a robot that
+# is calibrated once more by its own policy is not harmed.
+
+ANY_AGE = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None}}
+
+
+def not_counted(rig: Rig) -> list[str]:
+    """Folders that the journal names as sessions from the future."""
+    return [event["folder"] for event in rig.events if event["event"] == "a session from the future does not count"]
+
+
+@pytest.mark.parametrize("days", [3, 730])
+def test_a_job_under_a_later_date_does_not_hold_the_next_ones(tmp_path: Path, made: Made, days: int) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    rig.clock.at = BEGAN + timedelta(days=days)
+    assert rig.job().outcome is Outcome.APPLIED
+    wrong = rig.session
+    rig.clock.at = BEGAN + timedelta(hours=1)
+    # Due: the calibration under the wrong date does not count. What it has written is in force all the same.
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert not_counted(rig) == [str(wrong.folder)]
+    right, last = rig.sessions
+    assert last.folder == wrong.folder
+    # σ of the gains in force is that of the calibration which was written last, whatever its date is.
+    written = wrong.state.decision
+    compared = right.state.decision
+    assert written is not None
+    assert compared is not None
+    assert [gain.old_std for gain in compared.gains] == [gain.new_std for gain in written.gains]
+    assert right.folder.name.startswith("20260105T03")
+    rig.clock.go_on(hours=12)
+    ended = rig.job()
+    assert ended.outcome is Outcome.NOT_DUE
+    assert right.state.session in ended.remark
+    rig.clock.go_on(hours=12)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert len(rig.sessions) == 3
+
+
+def test_an_unfinished_session_under_a_later_date_is_not_continued(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE)
+    rig.clock.at = BEGAN + timedelta(days=730)
+    rig.closed.unlink()
+    with pytest.raises(NotReleased):
+        rig.job()
+    wrong = rig.session
+    rig.closed.touch()
+    rig.clock.at = BEGAN + timedelta(hours=1)
+    assert rig.job().outcome is Outcome.APPLIED
+    assert not_counted(rig) == [str(wrong.folder)]
+    assert wrong.folder.is_dir()
+
+
+def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    assert rig.job().outcome is Outcome.APPLIED
+    first = rig.session
+    rig.clock.at = BEGAN - timedelta(days=3)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert not_counted(rig) == [str(first.folder)]
+    # With the right date again, the first one is the newest one, and the ages are those of the right dates.
+    rig.clock.at = BEGAN + timedelta(hours=23)
+    ended = rig.job()
+    assert ended.outcome is Outcome.NOT_DUE
+    assert first.state.session in ended.remark
+    assert not_counted(rig) == [str(first.folder)]
+
+
+def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made)
     assert rig.job().outcome is Outcome.APPLIED
-    rig.clock.at = BEGAN - timedelta(days=3)
-    with pytest.raises(JobHeld, match="2026-01-02"):
+    rig.clock.at = BEGAN - timedelta(days=730)
+    with pytest.raises(JobHeld, match=r"found 2024-01-06.*set the clock \(`timedatectl`\)"):
         rig.job()
     assert len(rig.sessions) == 1
     assert exit_code(JobHeld) == ExitCode.JOB_HELD
+
+
+@pytest.mark.parametrize("days", [-730, -3, 3, 730])
+def test_a_clock_that_steps_in_a_session_changes_no_age(tmp_path: Path, made: Made, days: int) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    copied = rig.tools.record
+
+    def stepping(request: RecordingRequest, **further: Any) -> Recorded:
+        found: Recorded = copied(request, **further)
+        if request.out.stem == "loaded-1":
+            rig.clock.go_on(days=days)
+        return found
+
+    rig.tools = replace(rig.tools, record=stepping)
+    assert rig.job().outcome is Outcome.APPLIED
+    assert rig.session.folder.name.startswith("20260105T02")
+    assert rig.session.state.outcome is Outcome.APPLIED
+    rig.clock.at = BEGAN + timedelta(hours=23)
+    assert rig.job().outcome is Outcome.NOT_DUE
+    rig.clock.at = BEGAN + timedelta(hours=25)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert not_counted(rig) == []
+    assert len(rig.sessions) == 2
 
 
 def test_nothing_moves_without_the_cells_own_leave(tmp_path: Path, made: Made) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -16,11 +17,13 @@ from hypothesis import strategies as st
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.documents.session_state import JobState, Outcome, PlannedWrite
-from daq.errors import ExitCode, JobHeld
-from daq.jobs.context import CLOCK_SLACK, require_clock
+from daq.errors import ExitCode
+from daq.jobs.context import sessions_that_count
+from daq.jobs.journal import Form
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.reporting import Conclusion, file_stem, to_do
-from daq.jobs.session import STATE, Basis, Session, begin, remove_old, save, sessions
+from daq.jobs.session import CLOCK_SLACK, STATE, Basis, Session, begin, begun_until, remove_old, save, sessions
+from daq.jobs.story import Story
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, make_rig
 
@@ -139,11 +142,9 @@ def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, ti
 def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s: int) -> None:
     at, reported = BEGAN + timedelta(seconds=later_s), began.isoformat()
     state = JobState(session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported)
-    if began > at + CLOCK_SLACK:
-        with pytest.raises(JobHeld, match="the clock of this computer"):
-            require_clock((Session(Path("s"), state),), at)
-    else:
-        require_clock((Session(Path("s"), state),), at)
+    session = Session(Path("s"), state)
+    counted = begun_until((session,), at)
+    assert counted == (() if began > at + CLOCK_SLACK else (session,))
 
 
 def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(tmp_path: Path, made: Made) -> None:
@@ -151,11 +152,37 @@ def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibratio
     foreign = begin(rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099))
     ended = foreign.state.with_(outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat())
     save(replace(foreign, state=ended))
-    with pytest.raises(JobHeld, match="move that folder away") as caught:
-        rig.job()
-    assert str(foreign.folder) in str(caught.value)
-    shutil.rmtree(foreign.folder)
     assert rig.job().outcome is Outcome.APPLIED
+    (said,) = [event for event in rig.events if event["event"] == "a session from the future does not count"]
+    assert said["folder"] == str(foreign.folder)
+    assert "move the folder away" in said["text"]
+    assert foreign.folder.is_dir()
+
+
+def test_a_person_reads_which_session_does_not_count(tmp_path: Path) -> None:
+    present = begin(tmp_path, BASIS, BEGAN)
+    future = begin(tmp_path, BASIS, BEGAN + timedelta(days=730))
+    terminal = io.StringIO()
+    story = Story(terminal, Form.TEXT, lambda: BEGAN)
+    for _ in range(2):  # said once
+        assert sessions_that_count(sessions(tmp_path), BEGAN + timedelta(hours=1), story) == (present,)
+    said = " ".join(terminal.getvalue().split())
+    assert said.startswith("! a session from the future does not count: found")
+    assert said.count(future.state.began) == 1
+    assert "timedatectl" in said
+
+
+def test_a_session_from_the_future_is_neither_removed_nor_taken_for_the_newest(tmp_path: Path) -> None:
+    """The newest one is asked what killed jobs have left before it; by a wrong date, that is all there is."""
+    made = [begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week)) for week in range(3)]
+    future = begin(tmp_path, BASIS, BEGAN + timedelta(days=730))
+    just_begun = tmp_path / "20260201T000000Z"
+    just_begun.mkdir()
+    counted = begun_until(sessions(tmp_path), BEGAN + timedelta(days=15))
+    assert counted == tuple(made)
+    assert remove_old(counted, 2, ()) == (made[0].folder,)
+    assert future.folder.is_dir()
+    assert just_begun.is_dir()
 
 
 @given(st.lists(st.text(min_size=1, max_size=8), min_size=2, max_size=2, unique=True))

@@ -34,6 +34,7 @@ from daq.ledger.ledger import (
     record_write,
     verify_ledger,
 )
+from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, calibration_for, demo_calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, history_of, ledger_in, ledger_of, write
 
@@ -92,14 +93,18 @@ def test_the_same_file_is_entered_once(ledger: Ledger) -> None:
 
 
 def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> None:
-    for week in (3, 0, 2, 1):
-        enter(ledger, calibration_of(week))
+    def enter_later(calibration: Calibration, days: int) -> None:
+        at = BEGIN + timedelta(weeks=4, days=days)
+        enter_calibration(ledger, calibration, digest=digest_of(calibration), who="anna", at=at)
+
+    for day, week in enumerate((3, 0, 2, 1)):
+        enter_later(calibration_of(week), day)
     # Of another time zone, and at another spelling of it.
     late = replace(
         calibration_of(0),
         created=(BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat(),
     )
-    enter(ledger, late)
+    enter_later(late, 4)
     found = [entry.created for entry in read_history(ledger).entries]
     assert found == [BEGIN, BEGIN + timedelta(hours=1), *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3))]
 

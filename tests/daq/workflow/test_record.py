@@ -28,6 +28,8 @@ from drivers.errors import MotionRefused, NodeMisplaced, SampleLost
 from drivers.messages import EventKind
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
+SECOND_NS = 10**9
+DAY_NS = 86_400 * SECOND_NS
 WALL_NS = 1_700_000_000_000_000_000
 ELBOW, ELBOW_COUNTS = 3, round(radians(60) * 45 / (2 * 3.141592653589793) * 65536)
 PLAN = """format: drivegain-plan
@@ -248,7 +250,7 @@ def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
     assert (done.log.valid, done.log.reason) == (True, "")
 
 
-@pytest.mark.parametrize("step_ns", [0, 3_000_000_000])
+@pytest.mark.parametrize("step_ns", [0, 3 * SECOND_NS, 3 * DAY_NS, -3 * DAY_NS, 730 * DAY_NS, -730 * DAY_NS])
 def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     lockstep: Rig, step_ns: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

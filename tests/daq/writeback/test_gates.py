@@ -612,6 +612,15 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
     ]
 
 
+@pytest.mark.parametrize("days", [3, 730])
+def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(scene: Scene, days: int) -> None:
+    future = _source(0, recorded_s=(NOW + days * DAY).timestamp())(replace(scene, policy=ApplyPolicy()))
+    (refusal,) = future.propose().refusals
+    assert refusal.gate is Gate.STALE
+    assert refusal.found.endswith("from now")
+    assert "it keeps that date: record again and fit" in refusal.remedy
+
+
 def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
     cell = _payload(mass_kg=5.0)(scene).cell
     request = Request(scene.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import pytest
 
+from daq.environment import shipped_configurations
 from drivers.canopen.pdo import Direction, PdoRecord, fixed_setpoints
 from drivers.errors import SetupRefused
 from drivers.motion.execute import execute
@@ -134,3 +136,44 @@ def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
     used = fixed_setpoints(command + PROFILE_RPDOS)
     assert [record.number for record in used] == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
     assert all(record.transmission == 1 for record in used)
+
+
+_ELMO = {"elmo-gold", "generic-cia402", "schunk-pilz-prbt"}
+_SCHUNK = {"schunk-pilz-prbt", "beckhoff-el72x1"}
+FITTING: dict[str, set[str]] = {  # profiles whose objects the sheet has; a scale of another make is for a person to see
+    "pilz_prbt_0_1.dcf": _SCHUNK,
+    "Schunk_0_63_cob.dcf": _SCHUNK,
+    "Elmo_cob.dcf": _ELMO,
+    "ElmoSimplIQ_cob.dcf": _ELMO,
+    "maxon_epos4.eds": {"maxon-epos4"},
+    "ros2_canopen_cia402_slave.eds": set(),
+}
+PROFILES = sorted(
+    path.stem for path in (shipped_configurations() / "drives").glob("*.yaml") if path.stem != "technosoft-ipos"
+)  # which needs an entry of a person
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("file", FITTING)
+def test_each_data_sheet_is_set_up_by_each_profile_or_refused_in_words_and_left_as_it_was(
+    file: str, profile: str, shared_data: Path
+) -> None:
+    others = tuple(map(shipped, PROFILES))
+    network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile), profiles=lambda: others)
+    before = [settings(node) for node in bus.nodes]
+    refused = None
+    with contextlib.suppress(SetupRefused), network:
+        try:
+            network.prepare()
+        except SetupRefused as error:
+            refused = error
+            raise
+        assert network.readback().keys() == {"J1", "J2"}
+    if refused is not None:
+        said = str(refused)
+        assert said.startswith("J1 (node 1): found ")
+        assert f"; expected every object of profile {profile}; " in said
+        assert getattr(refused, "__notes__", []) == []
+        assert written(bus) == []
+    assert (refused is None) is (profile in FITTING[file])
+    assert [settings(node) for node in bus.nodes] == before

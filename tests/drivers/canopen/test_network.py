@@ -163,6 +163,136 @@ def test_a_node_without_heartbeat_cannot_confirm() -> None:
     assert any("closing the network" in note for note in refused.value.__notes__)
 
 
+@pytest.mark.parametrize("guard_ms", [None, 100])
+def test_a_drive_that_answers_sdo_and_sends_no_heartbeat_is_named(guard_ms: int | None) -> None:
+    """It was "its heartbeat still says nothing; read its error register"."""
+    network, bus = cell(2)
+    bus.nodes[1].beats = False
+    if guard_ms is not None:
+        bus.nodes[1].objects[0x100C, 0] = (guard_ms, 2)
+    with pytest.raises(StateRefused) as refused, network:
+        network.prepare()
+    said = str(refused.value)
+    assert "J2 (node 2)" in said
+    assert "it answers SDO and sends no heartbeat (1017h = 20)" in said
+    assert ("has node guarding (100Ch = 100)" in said) is (guard_ms is not None)
+    assert "use a firmware of the drive that has heartbeats" in said
+
+
+def test_a_drive_with_node_guarding_alone_is_refused_before_anything_is_written() -> None:
+    network, bus = cell(2)
+    del bus.nodes[1].objects[0x1017, 0]
+    bus.nodes[1].objects[0x100C, 0] = (100, 2)
+    with (
+        network,
+        pytest.raises(SetupRefused, match=r"no object 1017h:00 \(heartbeat period\).*node guarding \(100Ch\)"),
+    ):
+        network.prepare()
+    assert [frame for frame in bus.sent if frame.arbitration_id == 0x602 and frame.data[0] >> 5 == 1] == []
+
+
+REFUSED = 0x08000022  # "because of the present device state"
+
+
+@pytest.mark.parametrize(
+    ("index", "found", "expected", "remedy"),
+    [
+        (0x1017, "writing 1017h:00 is refused", "heartbeats of 20 ms", "firmware of the drive that has heartbeats"),
+        (0x6060, "writing 6060h:00 is refused", "profile position mode (1)", "choose the mode with its own tool"),
+    ],
+)
+def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
+    index: int, found: str, expected: str, remedy: str
+) -> None:
+    """It was the bare abort code of an object."""
+    network, bus = cell(2)
+    bus.nodes[1].aborts[index, 0] = REFUSED
+    settings = [(0x1017, 0), (0x6060, 0), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1400, 1), (0x1600, 0)]
+    before = [[node.value(*key) for key in settings] for node in bus.nodes]
+    with pytest.raises(SetupRefused) as refused, network:
+        network.prepare()
+    said = str(refused.value)
+    assert said.startswith("J2 (node 2): found")
+    for part in (found, "present device state", expected, remedy):
+        assert part in said
+    assert getattr(refused.value, "__notes__", []) == []
+    assert [[node.value(*key) for key in settings] for node in bus.nodes] == before
+
+
+@pytest.mark.parametrize(("modes", "named"), [(0b1, False), (0b1000_0000, True)])
+def test_a_drive_without_profile_position_mode_is_told_from_one_that_is_in_another(modes: int, named: bool) -> None:
+    network, bus = cell(1)
+    bus.nodes[0].aborts[0x6060, 0] = 0x06090030
+    bus.nodes[0].objects[0x6502, 0] = (modes, 4)
+    with pytest.raises(SetupRefused) as refused, network:
+        network.prepare()
+    assert ("6502h = 0x80, bit 0 is 0" in str(refused.value)) is named
+
+
+def test_a_drive_that_waits_for_sync_with_a_counter_gets_it_without_and_its_own_setting_back() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].objects[0x1019, 0] = (10, 1)
+    with network:
+        network.prepare()
+        assert bus.nodes[1].value(0x1019, 0) == 0
+        assert bus.nodes[1].on_sync(0)[0].arbitration_id == 0x182
+    assert bus.nodes[1].value(0x1019, 0) == 10
+
+
+def test_a_drive_that_keeps_waiting_for_a_counter_is_named() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].objects[0x1019, 0] = (10, 1)
+    bus.nodes[1].aborts[0x1019, 0] = REFUSED  # CiA 301: while its communication cycle period (1006h) is not 0
+    with pytest.raises(SetupRefused, match=r"J2 .*writing 1019h:00 is refused.*counter \(1019h = 10\)"), network:
+        network.prepare()
+    assert bus.nodes[1].on_sync(0) == []
+
+
+class BootingNode(ScriptedNode):
+    """Answers nothing until it has booted, and then sends its boot-up message."""
+
+    def __init__(self, node_id: int, clock: FakeClock, boots_s: float) -> None:
+        super().__init__(node_id)
+        self._clock = clock
+        self._up_ns = clock() + round(boots_s * 1e9)
+        self.nmt = 0
+        self.store(0x1017, 0, 60_000)  # one heartbeat when it is up: that of state 0 is the boot-up message
+        self.next_beat_ns = self._up_ns
+
+    def sdo(self, data: bytes) -> bytes | None:
+        if self._clock() < self._up_ns:
+            return None
+        if self.nmt == 0:
+            self.nmt = 127
+            self.store(0x1017, 0, 0)
+            self.next_beat_ns = 0
+        return super().sdo(data)
+
+
+def slowly_booting(boots_s: float) -> tuple[CanopenNetwork, ScriptedBus]:
+    network, bus = cell(2)
+    bus.nodes = (bus.nodes[0], BootingNode(2, bus.clock, boots_s))
+    return network, bus
+
+
+def test_a_drive_that_boots_while_it_is_searched_is_asked_again() -> None:
+    network, bus = slowly_booting(network_listens_s() + 0.05)
+    with network:
+        network.prepare()
+        assert bus.nodes[1].nmt == 5
+
+
+def test_a_drive_that_boots_later_is_said_to_be_missing_or_booting() -> None:
+    network, _ = slowly_booting(60.0)
+    with network, pytest.raises(NodeMissing, match=r"J2 \(node 2\) did not answer .*switched on just now"):
+        network.prepare()
+
+
+def network_listens_s() -> float:
+    network, _ = cell(1)
+    return network.bounds.listen_s
+
+
 def test_a_mapping_that_reads_back_differently_is_refused() -> None:
     network, bus = cell(1)
     bus.nodes[0].lies[0x1A00, 2] = 0x60770010

@@ -295,7 +295,7 @@ class Beating(ScriptedNode):
     def sdo(self, data: bytes) -> bytes | None:
         return None
 
-    def on_sync(self, cycle: int) -> list[can.Message]:
+    def on_sync(self, cycle: int, counted: bool = False) -> list[can.Message]:
         return []
 
 

@@ -238,6 +238,51 @@ def test_a_setpoint_that_is_never_acknowledged_ends_in_a_timeout(moving: Moving)
     assert powerless(bus)
 
 
+def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_move(moving: Moving) -> None:
+    """A drive without a buffer of set-points: bit 12 came too late for the time limit of the acknowledgement."""
+    _, _, bus, _ = moving
+    for node in bus.nodes:
+        node.holds_acknowledge = True
+    back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
+    samples = run(moving, FAR, back, FAR)
+    assert samples[-1].position_counts == (50_000, -40_000)
+    assert [len(node.setpoint_cycles) for node in bus.nodes] == [3, 3]
+
+
+def test_an_acknowledge_that_stays_for_ever_is_named_and_the_axes_lose_power(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    bus.nodes[1].keeps_acknowledge = True
+    with pytest.raises(
+        MotionTimeout, match=r"move 0: J2 \(node 2\) did not clear statusword bit 12.*earlier set-point"
+    ):
+        run(moving, FAR)
+    assert powerless(bus)
+
+
+def test_an_acknowledge_of_before_the_first_setpoint_starts_no_move(moving: Moving) -> None:
+    """By that bit the first set-point would be taken as accepted, and the time of the move waited for."""
+    _, _, bus, _ = moving
+    bus.nodes[1].keeps_acknowledge = True
+    bus.nodes[1].statusword |= 0x1000
+    with pytest.raises(MotionTimeout, match=r"move 0: J2 \(node 2\) did not clear statusword bit 12"):
+        run(moving, FAR)
+    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    assert powerless(bus)
+
+
+def test_a_drive_whose_rpdos_act_before_sync_makes_the_same_moves(moving: Moving) -> None:
+    """Target and controlword are in one frame, the target first, and velocities come before: no order is assumed."""
+    _, _, bus, _ = moving
+    for node in bus.nodes:
+        node.acts_at_once = True
+    back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
+    samples = run(moving, FAR, back)
+    assert samples[-1].position_counts == (0, 0)
+    assert [len(node.setpoint_cycles) for node in bus.nodes] == [2, 2]
+    assert not any(sample.missing for sample in samples)
+    assert powerless(bus)
+
+
 def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving) -> None:
     _, _, bus, _ = moving
     break_at(bus, 60, "nothing")
