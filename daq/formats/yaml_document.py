@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,6 +20,8 @@ from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, 
 
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
 _MERGE = "<<"
+_TABS = re.compile(r"[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
+"""Tabs before a comment and at the end of a line: white space in YAML 1.2 (6.6) and to libyaml."""
 _FLOAT = "tag:yaml.org,2002:float"
 
 
@@ -123,6 +126,9 @@ def _is_large(content: bytes) -> bool:
 
 @lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times
 def _composed(text: str, name: str, version: str) -> Any:
+    # The parsers in Python refuse these tabs. As many blanks keep every place in the text; the text itself keeps its
+    # tabs, and `locate` compares each number with it.
+    text = _TABS.sub(lambda tabs: " " * len(tabs[0]), text)
     try:
         if version == "1.2":
             root = YAML(typ="safe", pure=True).compose(text)

@@ -464,6 +464,43 @@ def test_an_object_that_cannot_be_changed_alone_is_refused(key: str, says: str) 
     assert says in str(caught.value)
 
 
+_RECORD = """\
+[2003]
+ObjectType={object_type}
+SubNumber=2
+[2003sub0]
+ObjectType=0x7
+DataType=0x0005
+ParameterValue=1
+[2003sub1]
+ObjectType=0x7
+DataType=0x0004
+ParameterValue=32960
+"""
+
+
+@pytest.mark.parametrize("object_type", ["0x8", "0x9", "8", "9"])
+def test_the_name_of_a_record_asks_for_a_subindex_and_not_to_remove_a_section(object_type: str) -> None:
+    document = DcfDocument("drive.dcf", _RECORD.format(object_type=object_type))
+    with pytest.raises(ControllerUnfit, match=r"\[2003\], an array or record.*name one of its subindices"):
+        document.locate(("2003",))
+    count, gain = document.locate(("2003:00", "2003:01"))
+    assert (count.value, gain.value) == (1.0, 32960.0)
+
+
+def test_a_variable_with_two_sections_is_still_refused() -> None:
+    document = DcfDocument("drive.dcf", _RECORD.format(object_type="0x7"))
+    with pytest.raises(ControllerUnfit, match="it 2 times, on lines 1 and 4"):
+        document.locate(("2003",))
+
+
+@pytest.mark.parametrize("value", ["$NODEID+0x10", "0x10+$NODEID", "$NodeId + 16"])
+def test_a_value_that_depends_on_the_node_is_refused_on_either_side(value: str) -> None:
+    text = f"[2003]\nDataType=0x0004\nParameterValue={value}\n"
+    with pytest.raises(ControllerUnfit, match="write a plain integer"):
+        DcfDocument("drive.dcf", text).locate(("2003",))
+
+
 @pytest.mark.parametrize("number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"])
 @pytest.mark.parametrize("entry", ["DataType", "ObjectType"])
 def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> None:
