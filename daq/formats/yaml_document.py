@@ -43,10 +43,14 @@ class YamlDocument(ControllerDocument):
         """Read as YAML 1.2 and as YAML 1.1."""
         return _values(_composed(self.text, self.name, "1.2")), _values(_composed(self.text, self.name, "1.1"))
 
+    def first_reading(self) -> Values:
+        """Read as YAML 1.2."""
+        return _values(_composed(self.text, self.name, "1.2"))
+
     def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
         node = root
         walked: KeyPath = ()
-        for step in key.split("."):
+        for step in self.path_of(key):
             node = self._child(node, step, key, walked)
             walked = (*walked, step)
             # A value that another place refers to by an alias cannot be changed without changing that place too.

@@ -695,3 +695,24 @@ def test_the_comment_behind_a_number_is_that_of_its_line(name: str, text: str, c
     as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(Path(name).suffix)
     if as_format is not None:
         assert comment_behind(rest, "a.conf", as_format) == comment
+
+
+_DOTTED_YAML = "node:\n  ros__parameters:\n    gains.J1.nm_per_a: 32.96\n    gains: {J2: {nm_per_a: -11.52}}\n"
+_DOTTED_JSON = '{"node": {"ros__parameters": {"gains.J1.nm_per_a": 32.96, "gains": {"J2": {"nm_per_a": -11.52}}}}}'
+
+
+@pytest.mark.parametrize(("name", "text"), [("ros2.yaml", _DOTTED_YAML), ("ros2.json", _DOTTED_JSON)])
+def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
+    document = decode_document(text.encode(), name)
+    keys = ("node.ros__parameters.gains.J1.nm_per_a", "node.ros__parameters.gains.J2.nm_per_a")
+    assert [one.value for one in document.locate(keys)] == [32.96, -11.52]
+    assert document.with_values({keys[0]: "33.10"}).text == text.replace("32.96", "33.10")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.yaml", "a.b: 1.5\na: {b: 2.5}\n"), ("a.json", '{"a.b": 1.5, "a": {"b": 2.5}}')]
+)
+def test_a_key_that_two_places_read_as_is_refused(name: str, text: str) -> None:
+    document = decode_document(text.encode(), name)
+    with pytest.raises(ControllerUnfit, match=r"2 places that read as this key: (a\.b and a / b|a / b and a\.b)"):
+        document.locate(("a.b",))
