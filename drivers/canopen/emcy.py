@@ -54,7 +54,7 @@ def explain(code: int) -> ErrorCode:
 def remedy_of(code: int) -> str:
     """Return what to try first for an error code; the drive's manual says more."""
     if code >> 8 == _NO_ERROR:
-        return "nothing to do: the drive reports no error"
+        return "nothing: the drive reports no error"
     first = "check brake, load and collision; use slower moves" if code >> 8 in (0x84, 0x85, 0x86) else ""
     first = first or _REMEDIES.get(code >> 12, "see the drive's manual")
     return f"{first}; then reset the fault with `CanopenNetwork.reset_faults`"

@@ -43,7 +43,7 @@ def test_every_code_has_a_remedy_of_its_class() -> None:
 
 @pytest.mark.parametrize("code", [0x0000, 0x0001, 0x00FF])
 def test_a_code_of_no_error_asks_for_nothing(code: int) -> None:
-    assert remedy_of(code) == "nothing to do: the drive reports no error"
+    assert remedy_of(code) == "nothing: the drive reports no error"
 
 
 def test_the_class_after_no_error_still_asks_for_a_reset() -> None:
