@@ -23,6 +23,7 @@ drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -244,12 +245,33 @@ class TimeBoundReached(JobHeld):
     """The job exceeded its time limit; the axes were stopped."""
 
 
+class OwnerNotKept(PermissionError):
+    """A new file cannot have the owner and group of the one that it would replace: nothing is written."""
+
+    def __init__(self, path: Path, differing: str) -> None:
+        """Store what differs.
+
+        Args:
+            path: file that would be replaced.
+            differing: its owner and group where a new file of this user has others, in words.
+        """
+        super().__init__(errno.EPERM, f"this user may not make a file of its {differing}", str(path))
+
+
 class OutputFailed(DaqError):
     """The disk is full, or the folder is read-only."""
 
     @classmethod
     def of(cls, path: Path, error: OSError) -> OutputFailed:
         """Make the error for a file that was replaced whole or not at all."""
+        if isinstance(error, OwnerNotKept):
+            return cls(
+                str(path),
+                found=reason_of(error),
+                expected="a user who may keep owner and group of the file, so that who reads it now can read it then",
+                remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, or `usermod -aG` "
+                "and a new login), or give the file to this user (`chown`, `chgrp`) if the controller can read it then",
+            )
         return cls(
             str(path),
             found=reason_of(error),

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import grp
 import hashlib
 import os
+import pwd
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
+
+from daq.errors import OwnerNotKept
 
 
 def replace_file(
@@ -277,11 +281,40 @@ def _new_file(target: Path, mode: int) -> tuple[Path, int]:
         attempt += 1
 
 
+def _ownership_differences(found: os.stat_result, wanted: os.stat_result) -> str:
+    """Say in what owner and group of a new file differ from those of the file that it would replace."""
+    differing = []
+    if found.st_uid != wanted.st_uid:
+        differing.append(f"owner {_user_name(wanted.st_uid)}, not {_user_name(found.st_uid)}")
+    if found.st_gid != wanted.st_gid:
+        differing.append(f"group {_group_name(wanted.st_gid)}, not {_group_name(found.st_gid)}")
+    return " and ".join(differing)
+
+
+def _user_name(number: int) -> str:
+    """Return the name of a user; the number where no one has it."""
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)
+
+
+def _group_name(number: int) -> str:
+    """Return the name of a group; the number where none has it."""
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
 def _copy_rights(descriptor: int, like: Path) -> None:
     wanted = like.stat()
     found = os.fstat(descriptor)
     if (found.st_uid, found.st_gid) != (wanted.st_uid, wanted.st_gid):
-        os.fchown(descriptor, wanted.st_uid, wanted.st_gid)
+        try:
+            os.fchown(descriptor, wanted.st_uid, wanted.st_gid)
+        except PermissionError as error:
+            raise OwnerNotKept(like, _ownership_differences(found, wanted)) from error
     _copy_attributes(descriptor, like)
     os.fchmod(descriptor, wanted.st_mode & 0o7777)
 

@@ -20,6 +20,7 @@ from daq.errors import (
     DataError,
     HistoryUnreadable,
     UsageError,
+    counted,
     evidence,
 )
 from daq.files import sha256
@@ -114,6 +115,7 @@ def history_verb(
         print_json(history_report(declared.name, history.entries, chosen, all_series, current, checked))
     else:
         if checked is not None:
+            _require_log(ledger, checked)  # before the page calls the history sound
             say_verification(checked, console)
         elif axis is not None:
             show_axis(chosen[0], all_series, actions, console)
@@ -122,6 +124,25 @@ def history_verb(
         say_written(console, plot, csv)
     if checked is not None:
         _require(ledger, checked)
+        _require_log(ledger, checked)
+
+
+def _require_log(ledger: Ledger, checked: Verification) -> None:
+    """Refuse to call a history whole whose audit log is absent, where backups show that there were writes."""
+    from daq.writeback.file_access import backups_without_log, resolve_links
+
+    controller = ledger.cell.controller_path
+    if controller is None or not checked.verdict.holds:  # what is broken is said first
+        return
+    count = backups_without_log(ledger.audit, resolve_links(controller))
+    if count > 0:
+        raise DataError(
+            str(ledger.audit),
+            found=f"no file, although {controller} has {counted(count, 'backup')} of earlier writes beside it",
+            expected="the audit log with these writes",
+            remedy="restore it with its `.head`, and ask who removed it; if it is kept elsewhere on purpose, go on: "
+            "the next write begins a new log, and says so in it",
+        )
 
 
 def _read(ledger: Ledger, verify: bool) -> tuple[Verification | None, History, tuple[Series, ...]]:

@@ -7,6 +7,8 @@ two robots of one make have the same axes and joints, and a copied cell file eve
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -102,6 +104,44 @@ def _has_exchanged_nodes(own: Cell, given: Cell) -> bool:
     first = [axis.node_id for axis in own.axes]
     second = [axis.node_id for axis in given.axes]
     return first != second and set(first) == set(second)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotIdentity:
+    """What tells a robot from another of the same name and axes, for a file that is made for one of them.
+
+    What a description corrects (zero offsets, gravity, lengths, masses, nameplate gains) is no part of it, nor is a
+    serial number: a drive that is exchanged does not make a robot another one.
+    """
+
+    kinematics_sha256: str  #: of joints, their kinds and order, and the motors of a closed chain, hex
+    drives_sha256: str  #: of node id, vendor and product code of each axis, hex
+
+    def differences(self, expected: RobotIdentity) -> tuple[str, ...]:
+        """Name the parts that differ: none for the same robot."""
+        parts = []
+        if self.kinematics_sha256 != expected.kinematics_sha256:
+            parts.append("joints (names, kinds, parents or motors)")
+        if self.drives_sha256 != expected.drives_sha256:
+            parts.append("drives (node ids, vendors or product codes)")
+        return tuple(parts)
+
+
+def robot_identity(cell: Cell) -> RobotIdentity:
+    """Return the identity of a cell's robot."""
+    parents = [joint.parent for joint in read_urdf(cell.urdf).joints]
+    kinematics = [_joints(cell), parents]
+    drives = []
+    for axis in cell.axes:
+        identity = axis.identity
+        vendor_id = None if identity is None else identity.vendor_id
+        product_code = None if identity is None else identity.product_code
+        drives.append([axis.name, axis.node_id, vendor_id, product_code])
+    return RobotIdentity(_sha256(kinematics), _sha256(drives))
+
+
+def _sha256(content: object) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:

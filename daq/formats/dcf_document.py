@@ -78,6 +78,11 @@ class DcfDocument(ControllerDocument):
             if (title := _TITLE.fullmatch(section.title))  # 2003sub1 and 2003sub01 are one object
             and (int(title[1], 16), int(title[2] or "0", 16)) == (index, subindex)
         ]
+        records = [section for section in found if self._is_record(section, key)]
+        if records and match[2] is None:
+            raise self.unfit(key, f"[{records[0].title}], an array or record", "name one of its subindices")
+        # CiA 306 gives an array or record a section of its own beside that of its subindex 0.
+        found = [section for section in found if section not in records]
         if len(found) > 1:
             lines = " and ".join(str(section.line) for section in found)
             raise self.unfit(key, f"it {len(found)} times, on lines {lines}", "remove all but one")
@@ -87,6 +92,13 @@ class DcfDocument(ControllerDocument):
             titles = ([f"{index:04x}"] if subindex == 0 else []) + [f"{index:04x}sub{subindex:x}"]
             raise self.unfit(key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
         return found[0]
+
+    def _is_record(self, section: DcfSection, key: str) -> bool:
+        """Whether a section is that of an array or record as a whole."""
+        if "sub" in section.title:
+            return False
+        entries = {entry.name: entry for entry in section.entries}
+        return self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE
 
     def _locate(self, sections: list[DcfSection], key: str) -> Scalar:
         section = self._section(sections, key)

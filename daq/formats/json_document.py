@@ -35,6 +35,10 @@ class JsonDocument(ControllerDocument):
         """Read with our scanner, and with Python's parser."""
         return {path: token.text for path, token in self._scanned().items()}, self._loaded()
 
+    def first_reading(self) -> Values:
+        """Read with our scanner."""
+        return {path: token.text for path, token in self._scanned().items()}
+
     def _scanned(self) -> dict[KeyPath, _Token]:
         """Return every value with its place, and `{}` or `[]` with the size of every object and list."""
         self._loaded()  # refuses all that is not JSON: the scanner need not

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Self
 
 from daq.errors import ControllerUnfit
@@ -155,6 +156,20 @@ def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) 
     return RewrittenGain(scalar.value / factor, number / factor, spelling)
 
 
+def paths_of(key: str, paths: Collection[KeyPath]) -> tuple[KeyPath, ...]:
+    """Return every path in a file that reads as a dotted key: names of the file may have dots themselves.
+
+    Args:
+        key: such as `ros__parameters.gains.joint1`.
+        paths: of all values of the file.
+
+    Returns:
+        the key split at every dot where no path reads so; more than one path where the key is ambiguous.
+    """
+    found = tuple(path for path in paths if ".".join(path) == key)
+    return found or (tuple(key.split(".")),)
+
+
 @dataclass(frozen=True, slots=True)
 class ControllerDocument(ABC):
     """A controller's file as it was read."""
@@ -184,6 +199,10 @@ class ControllerDocument(ABC):
             ControllerUnfit: a parser cannot read the text.
         """
 
+    def first_reading(self) -> Values:
+        """Return the values as the first parser of `readings` reads them."""
+        return self.readings()[0]
+
     def unfit(
         self, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
     ) -> ControllerUnfit:
@@ -193,8 +212,16 @@ class ControllerDocument(ABC):
         )
 
     def path_of(self, key: str) -> KeyPath:
-        """Return the path of a key's number among the values; here a dotted one (`drives.J1.gain`, `gains.0`)."""
-        return tuple(key.split("."))
+        """Return the path of a key's number among the values; here a dotted one (`drives.J1.gain`, `gains.0`).
+
+        Raises:
+            ControllerUnfit: several places of the file read as this key.
+        """
+        found = paths_of(key, _paths(self))
+        if len(found) > 1:
+            places = " and ".join(" / ".join(path) for path in found)
+            raise self.unfit(key, f"{len(found)} places that read as this key: {places}", "rename one of them")
+        return found[0]
 
     def number(self, value: str) -> str:
         """Return the number in a value, without what readers of the format ignore around it."""
@@ -266,3 +293,9 @@ def utf8(content: bytes, name: str, kind: str) -> str:
             expected=f"{kind} in UTF-8",
             remedy="save the file as UTF-8; nothing was written",
         ) from error
+
+
+@lru_cache(maxsize=8)  # every key of a file asks for them
+def _paths(document: ControllerDocument) -> Collection[KeyPath]:
+    """Return the path of every value of a document."""
+    return tuple(document.first_reading())

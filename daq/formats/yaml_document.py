@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,6 +20,8 @@ from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, 
 
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
 _MERGE = "<<"
+_TABS = re.compile(r"[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
+"""Tabs before a comment and at the end of a line: white space in YAML 1.2 (6.6) and to libyaml."""
 _FLOAT = "tag:yaml.org,2002:float"
 
 
@@ -40,10 +43,14 @@ class YamlDocument(ControllerDocument):
         """Read as YAML 1.2 and as YAML 1.1."""
         return _values(_composed(self.text, self.name, "1.2")), _values(_composed(self.text, self.name, "1.1"))
 
+    def first_reading(self) -> Values:
+        """Read as YAML 1.2."""
+        return _values(_composed(self.text, self.name, "1.2"))
+
     def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
         node = root
         walked: KeyPath = ()
-        for step in key.split("."):
+        for step in self.path_of(key):
             node = self._child(node, step, key, walked)
             walked = (*walked, step)
             # A value that another place refers to by an alias cannot be changed without changing that place too.
@@ -123,6 +130,9 @@ def _is_large(content: bytes) -> bool:
 
 @lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times
 def _composed(text: str, name: str, version: str) -> Any:
+    # The parsers in Python refuse these tabs. As many blanks keep every place in the text; the text itself keeps its
+    # tabs, and `locate` compares each number with it.
+    text = _TABS.sub(lambda tabs: " " * len(tabs[0]), text)
     try:
         if version == "1.2":
             root = YAML(typ="safe", pure=True).compose(text)

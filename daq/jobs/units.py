@@ -19,7 +19,8 @@ MARKS = (MARK, "# Made by `drivegain install-units`, which may replace this file
 """The same and that of earlier versions; a file of that name without one of them is not ours."""
 _SEARCHED = (("systemd", "system"), ("systemd", "user"))  #: Ends of the folders in which systemd finds units
 STOP_S = 30  #: Time for the axes to stop and the session to be saved, after SIGTERM [s]
-CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}
+CRON = {"hourly": "0 * * * *", "daily": "0 0 * * *", "weekly": "0 0 * * 1", "monthly": "0 0 1 * *"}
+"""The dates of crontab(5) that systemd.time(7) means by a word: `weekly` is Monday 00:00 for both."""
 _NEEDS_LITTLE = """\
 NoNewPrivileges=yes
 ProtectSystem=full

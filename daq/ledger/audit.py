@@ -30,6 +30,8 @@ MAX_BYTES = 2**30  #: Largest audit log; it is read whole
 _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 FIRST = "0" * 64  #: Previous digest of the first entry
 GONE = "gone"  #: Takes the place of a missing file's digest
+BACKUPS_WITHOUT_LOG = "backups_without_log"
+"""Detail of the first write in a log: the number of backups of earlier writes, which this log does not have."""
 _BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
 _DIGEST = b',"sha256":"'  #: Before the digest of a line; in a text of it, the quotation marks would be escaped
 _DIGITS = 64  #: Of a digest, hexadecimal

@@ -18,7 +18,7 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit, counted
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import head_file
+from daq.ledger.audit import BACKUPS_WITHOUT_LOG, head_file
 from daq.ledger.fold import Entry, Event, History, WriteAction, drives_of
 from daq.ledger.ledger import Verification
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
@@ -358,6 +358,13 @@ def say_verification(found: Verification, console: Console) -> None:
             f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
             f"ended; {printable(begun.subject)} was found {one.content.value}."
         )
+    for entry in verdict.entries:
+        count = entry.details.get(BACKUPS_WITHOUT_LOG)
+        if isinstance(count, int):
+            console.print(
+                f"Entry {entry.number} began this audit log, although {printable(entry.subject)} had "
+                f"{counted(count, 'backup')} of earlier writes: an earlier log was removed or moved."
+            )
     state = "sound"
     if not verdict.holds:
         state = "not known, because entries may be missing"

@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.same_cell import RobotIdentity, robot_identity
 from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError, counted
 from daq.files import replace_file
@@ -65,6 +66,7 @@ class Plan:
     moves: tuple[PlannedMove, ...]  #: in order
     units: tuple[JointUnit, ...]  #: in which people read the targets, one a joint
     purpose: str = ""  #: what it was planned for, in words for its page; empty for a first plan, which is for all gains
+    robot: RobotIdentity | None = None  #: of the robot it was made for; None in plans of earlier versions
 
 
 DWELL_S = 0.1
@@ -561,6 +563,7 @@ def plan(
         duration_s=used_s,
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
+        robot=robot_identity(cell),
     )
 
 
@@ -655,6 +658,7 @@ LEAST_VELOCITY = 0.01  #: Share of the limits; slower than that a move would har
 LEAST_ACCELERATION = 0.0001  #: A hundredth of the speed on the same ways is a ten-thousandth of the acceleration
 Velocity = Annotated[float, Field(ge=LEAST_VELOCITY, le=1)]
 Acceleration = Annotated[float, Field(ge=LEAST_ACCELERATION, le=1)]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class _Move(StrictModel):
@@ -671,6 +675,11 @@ class _Move(StrictModel):
         return self
 
 
+class _Robot(StrictModel):
+    kinematics_sha256: Digest
+    drives_sha256: Digest
+
+
 class _Plan(StrictModel):
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
 
@@ -681,6 +690,7 @@ class _Plan(StrictModel):
     # Plans of earlier versions have none.
     predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
     purpose: str = ""
+    robot: _Robot | None = None
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
 
 
@@ -725,6 +735,10 @@ def save_plan(plan: Plan, path: Path) -> None:
     ]
     if plan.purpose:
         lines.append(f"purpose: {json.dumps(plan.purpose)}")  # a string of JSON is one of YAML
+    if plan.robot is not None:
+        lines.append("robot:    # a plan is for one robot")
+        lines.append(f"  kinematics_sha256: {plan.robot.kinematics_sha256}")
+        lines.append(f"  drives_sha256: {plan.robot.drives_sha256}")
     lines.append("moves:")
     for move in plan.moves:
         target = ", ".join(f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True))
@@ -742,12 +756,14 @@ def load_plan(path: Path, cell: Cell) -> Plan:
 
     Raises:
         ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,
-            the plan takes longer than an hour, or a way leaves the declared workspace or clearance.
+            the plan takes longer than an hour, a way leaves the declared workspace or clearance, or the plan was made
+            for another robot with the same cell name.
     """
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
         raise _refused(str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy)
+    robot = _robot_of(path, model.robot, cell)
     if len(model.predicted_std_percent) not in (0, len(cell.axes)):
         found = f"{len(model.predicted_std_percent)} numbers"
         remedy = "make the plan anew: `drivegain plan CELL`"
@@ -768,7 +784,25 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         moves=moves,
         units=tuple(axis.unit for axis in cell.axes),
         purpose=model.purpose,
+        robot=robot,
     )
+
+
+def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> RobotIdentity | None:
+    """Return the robot that a plan is for, None for a plan of an earlier version; refuse that of another robot."""
+    if stated is None:
+        return None
+    found = RobotIdentity(stated.kinematics_sha256, stated.drives_sha256)
+    differences = found.differences(robot_identity(cell))
+    if differences:
+        differing = " and ".join(differences)
+        raise _refused(
+            f"{path}: robot",
+            f"a plan for another robot with the same cell name {cell.name!r}; what differs: {differing}",
+            "a plan for the robot that the cell file describes",
+            "give the cell file that the plan was made with, or make a plan for this cell: `drivegain plan CELL`",
+        )
+    return found
 
 
 def _key(units: tuple[JointUnit, ...]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
@@ -145,6 +146,19 @@ def backups(target: Path) -> tuple[Backup, ...]:
         if (match := name.fullmatch(path.name)) is not None
     ]
     return tuple(sorted(found, key=lambda one: (one.stamp, one.count)))
+
+
+def backups_without_log(audit: Path, target: Path) -> int:
+    """Return the number of backups beside a controller file whose audit log is absent; 0 where there is a log.
+
+    A write that is audited leaves both: backups alone show that the log was removed or moved, or that another is used.
+    """
+    if os.path.lexists(audit):
+        return 0
+    try:
+        return len(backups(target))
+    except OSError:  # a folder that is gone or may not be read
+        return 0
 
 
 def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, evidence, reason_of
+from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, counted, evidence, reason_of
 from daq.files import sha256
-from daq.ledger.audit import GONE, AuditAction, AuditEntry, digest_now
+from daq.ledger.audit import BACKUPS_WITHOUT_LOG, GONE, AuditAction, AuditEntry, digest_now
 from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
+from daq.writeback.file_access import backups_without_log
 from daq.writeback.gates.fit import OF_DESCRIPTION
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
@@ -223,7 +224,7 @@ def _write(
             held.enter_context(target.lock(edit))
         before = None if edit.before is None else sha256(edit.before)
         digests = {"sha256_before": before, "sha256_after": sha256(edit.after)}
-        begun = recorder.begin(actions[0], {**digests, **details})
+        begun = recorder.begin(actions[0], {**digests, **details, **_absence_of_log(recorder)})
         try:
             written = target.write(edit, recorder.at, recorder.who)
         except BaseException as error:  # an interrupt ends a write too
@@ -241,6 +242,27 @@ def _write(
         if begun is not None:
             recorder.end(actions[1], {"begun": begun.number})
         return written
+
+
+def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
+    """Return what a new audit log says of the one that is absent; empty where none is missed.
+
+    The write goes on: who removed the log must not thereby keep a technician from rolling back.
+    """
+    subject = Path(recorder.subject)
+    if recorder.audit is None or not subject.is_absolute():  # drives have no backups in files
+        return {}
+    count = backups_without_log(recorder.audit, subject)
+    if count == 0:
+        return {}
+    _LOG.warning(
+        "%s is absent, although %s has %s of earlier writes beside it: a new audit log begins with this write, and "
+        "says so; if the old one was not moved on purpose, restore it and ask who removed it",
+        recorder.audit,
+        subject,
+        counted(count, "backup"),
+    )
+    return {BACKUPS_WITHOUT_LOG: count}
 
 
 def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:

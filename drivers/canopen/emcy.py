@@ -22,6 +22,7 @@ CODES = {int(digits, 16): text for digits, text in _TEXTS.items() if len(digits)
 """Text of each code that the two standards name."""
 
 
+_NO_ERROR = 0x00  #: Upper byte of the codes that report that there is no error, or none any more
 _REMEDIES = {
     0x2: "check motor cable and windings for shorts, and the load; let the drive cool",
     0x3: "check the supply voltage and the brake resistor; use slower moves",
@@ -52,6 +53,8 @@ def explain(code: int) -> ErrorCode:
 
 def remedy_of(code: int) -> str:
     """Return what to try first for an error code; the drive's manual says more."""
+    if code >> 8 == _NO_ERROR:
+        return "nothing: the drive reports no error"
     first = "check brake, load and collision; use slower moves" if code >> 8 in (0x84, 0x85, 0x86) else ""
     first = first or _REMEDIES.get(code >> 12, "see the drive's manual")
     return f"{first}; then reset the fault with `CanopenNetwork.reset_faults`"

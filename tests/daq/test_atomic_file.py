@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 import struct
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from daq.errors import OutputFailed, OwnerNotKept
 from daq.files import replace_file
 
 ACCESS, DEFAULT = "system.posix_acl_access", "system.posix_acl_default"
@@ -150,3 +154,51 @@ def test_no_one_else_can_open_the_unfinished_copy_of_a_file_of_one_s_own(
     monkeypatch.setattr(os, "fchmod", fchmod)
     replace_file(path, b"new")
     assert modes == [0o600]
+
+
+_NOBODY = 65534
+_FOREIGN = 4711  #: A user and group that no one is in
+
+
+@pytest.fixture
+def shared_folder() -> Iterator[Path]:
+    """A folder that every user can write to; those above a folder of pytest are for root alone."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o777)
+        yield folder
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to another user")
+@pytest.mark.parametrize(
+    ("owner", "group", "says"),
+    [
+        (_NOBODY, _FOREIGN, r"a file of its group 4711, not \S+$"),
+        (_FOREIGN, _FOREIGN, r"a file of its owner 4711, not \S+ and group 4711, not \S+$"),
+    ],
+)
+def test_a_file_whose_owner_or_group_cannot_be_kept_stays_and_the_difference_is_named(
+    shared_folder: Path, owner: int, group: int, says: str
+) -> None:
+    path = shared_folder / "controller.yaml"
+    path.write_bytes(b"old")
+    os.chown(path, owner, group)
+    os.seteuid(_NOBODY)
+    try:
+        with pytest.raises(OwnerNotKept) as caught:
+            replace_file(path, b"new")
+    finally:
+        os.seteuid(0)
+    assert re.search(says, str(caught.value.strerror))
+    assert path.read_bytes() == b"old"
+    assert list(shared_folder.iterdir()) == [path]
+
+
+def test_an_owner_that_cannot_be_kept_is_no_matter_of_free_space() -> None:
+    error = OwnerNotKept(Path("controller.yaml"), "group plc, not users")
+    failed = OutputFailed.of(Path("controller.yaml"), error)
+    assert failed.found == "this user may not make a file of its group plc, not users"
+    assert "free space" not in failed.remedy
+    assert "chgrp" in failed.remedy
+    other = OutputFailed.of(Path("controller.yaml"), OSError(28, "No space left on device"))
+    assert "free space" in other.remedy

@@ -9,7 +9,7 @@ import pkgutil
 import daq
 import drivers
 import ident
-from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
+from daq.errors import CalibrationRefused, DaqError, OutputFailed, OwnerNotKept, SchemaMismatch, UsageError, exit_code
 from daq.log.feed import FeedUnfit
 from drivers.canopen.sdo import TransferUnboundedError
 from drivers.errors import DriverError, SetupRefused
@@ -30,8 +30,9 @@ def test_every_exception_class_has_an_exit_code() -> None:
     kinds = _exceptions()
     assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
     # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, FeedUnfit is said on the
-    # console's page, TransferUnboundedError becomes an ObjectAccessError: they end no command.
-    inner = {DaqError, SdoAbort, FeedUnfit, TransferUnboundedError}
+    # console's page, TransferUnboundedError becomes an ObjectAccessError, OwnerNotKept is an OSError that becomes an
+    # OutputFailed: they end no command.
+    inner = {DaqError, SdoAbort, FeedUnfit, TransferUnboundedError, OwnerNotKept}
     unmapped = {kind.__qualname__ for kind in kinds - inner if exit_code(kind) is None}
     assert not unmapped
 

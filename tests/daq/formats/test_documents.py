@@ -464,6 +464,43 @@ def test_an_object_that_cannot_be_changed_alone_is_refused(key: str, says: str) 
     assert says in str(caught.value)
 
 
+_RECORD = """\
+[2003]
+ObjectType={object_type}
+SubNumber=2
+[2003sub0]
+ObjectType=0x7
+DataType=0x0005
+ParameterValue=1
+[2003sub1]
+ObjectType=0x7
+DataType=0x0004
+ParameterValue=32960
+"""
+
+
+@pytest.mark.parametrize("object_type", ["0x8", "0x9", "8", "9"])
+def test_the_name_of_a_record_asks_for_a_subindex_and_not_to_remove_a_section(object_type: str) -> None:
+    document = DcfDocument("drive.dcf", _RECORD.format(object_type=object_type))
+    with pytest.raises(ControllerUnfit, match=r"\[2003\], an array or record.*name one of its subindices"):
+        document.locate(("2003",))
+    count, gain = document.locate(("2003:00", "2003:01"))
+    assert (count.value, gain.value) == (1.0, 32960.0)
+
+
+def test_a_variable_with_two_sections_is_still_refused() -> None:
+    document = DcfDocument("drive.dcf", _RECORD.format(object_type="0x7"))
+    with pytest.raises(ControllerUnfit, match="it 2 times, on lines 1 and 4"):
+        document.locate(("2003",))
+
+
+@pytest.mark.parametrize("value", ["$NODEID+0x10", "0x10+$NODEID", "$NodeId + 16"])
+def test_a_value_that_depends_on_the_node_is_refused_on_either_side(value: str) -> None:
+    text = f"[2003]\nDataType=0x0004\nParameterValue={value}\n"
+    with pytest.raises(ControllerUnfit, match="write a plain integer"):
+        DcfDocument("drive.dcf", text).locate(("2003",))
+
+
 @pytest.mark.parametrize("number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"])
 @pytest.mark.parametrize("entry", ["DataType", "ObjectType"])
 def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> None:
@@ -658,3 +695,24 @@ def test_the_comment_behind_a_number_is_that_of_its_line(name: str, text: str, c
     as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(Path(name).suffix)
     if as_format is not None:
         assert comment_behind(rest, "a.conf", as_format) == comment
+
+
+_DOTTED_YAML = "node:\n  ros__parameters:\n    gains.J1.nm_per_a: 32.96\n    gains: {J2: {nm_per_a: -11.52}}\n"
+_DOTTED_JSON = '{"node": {"ros__parameters": {"gains.J1.nm_per_a": 32.96, "gains": {"J2": {"nm_per_a": -11.52}}}}}'
+
+
+@pytest.mark.parametrize(("name", "text"), [("ros2.yaml", _DOTTED_YAML), ("ros2.json", _DOTTED_JSON)])
+def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
+    document = decode_document(text.encode(), name)
+    keys = ("node.ros__parameters.gains.J1.nm_per_a", "node.ros__parameters.gains.J2.nm_per_a")
+    assert [one.value for one in document.locate(keys)] == [32.96, -11.52]
+    assert document.with_values({keys[0]: "33.10"}).text == text.replace("32.96", "33.10")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.yaml", "a.b: 1.5\na: {b: 2.5}\n"), ("a.json", '{"a.b": 1.5, "a": {"b": 2.5}}')]
+)
+def test_a_key_that_two_places_read_as_is_refused(name: str, text: str) -> None:
+    document = decode_document(text.encode(), name)
+    with pytest.raises(ControllerUnfit, match=r"2 places that read as this key: (a\.b and a / b|a / b and a\.b)"):
+        document.locate(("a.b",))

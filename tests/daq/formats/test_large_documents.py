@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,12 @@ LARGE = {
     "nested": GAIN + "more: " + "[" * 2000 + "]" * 2000,
     "unclosed": GAIN + "more: " + "[" * 200_000,
 }
+
+
+def test_the_page_states_the_limits_of_yaml(checkout: Path) -> None:
+    page = (checkout / "docs/how-to/write-gains.md").read_text(encoding="utf-8")
+    values = f"{limits.MAX_VALUES:,}".replace(",", " ")
+    assert f"YAML of up to {limits.MAX_BYTES // 1024} KiB and {values} values" in page
 
 
 @pytest.mark.parametrize("text", LARGE.values(), ids=LARGE)

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from daq.errors import ControllerUnfit
 from daq.formats.document import decode_document
 from daq.formats.scalar import spell
-from daq.formats.yaml_document import YamlDocument
+from daq.formats.yaml_document import YamlDocument, yaml_document
 from tests.daq.formats.yaml_cases import NUMBERS, Case, cases
 
 
@@ -160,3 +160,17 @@ def test_the_second_look_finds_any_other_change(other: str) -> None:
 def test_a_bomb_of_aliases_is_no_danger() -> None:
     text = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)) + "gain: 1.0\n"
     assert "gain: 2.5000\n" in YamlDocument("robot.yaml", text).with_values({"gain": "2.5000"}).text
+
+
+@pytest.mark.parametrize("gap", ["\t", " \t", "\t\t ", " \t \t"])
+@pytest.mark.parametrize("behind", ["# Nm/A", ""])
+def test_tabs_behind_a_number_are_read_and_stay(gap: str, behind: str) -> None:
+    text = f"J1:\n  gain: 32.96{gap}{behind}\nJ2:\n  gain: -11.52 # tab\tinside\n"
+    document = yaml_document(text.encode(), "controller.yaml")
+    assert [one.value for one in document.locate(("J1.gain", "J2.gain"))] == [32.96, -11.52]
+    assert document.with_values({"J1.gain": "33.10"}).text == text.replace("32.96", "33.10")
+
+
+def test_a_tab_that_indents_is_still_no_yaml() -> None:
+    with pytest.raises(ControllerUnfit, match="no YAML"):
+        yaml_document(b"J1:\n\tgain: 32.96\n", "controller.yaml").locate(("J1.gain",))

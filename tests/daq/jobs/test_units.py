@@ -151,10 +151,27 @@ def test_a_unit_of_an_earlier_version_is_replaced(rig: Rig, tmp_path: Path, caps
 def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schedule", "--cell", str(rig.cell_file), "--cron"]) == ExitCode.OK
     line = capsys.readouterr().out
-    assert line.startswith("0 3 * * 0  ")
+    assert line.startswith("0 0 * * 1  ")
     assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
     assert line.count("\n") == 1
     assert main(["schedule", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"]) == ExitCode.USAGE
+
+
+@pytest.mark.parametrize(
+    ("word", "minute", "hour", "day_of_month", "day_of_week"),
+    [
+        # Dates of systemd.time(7): *-*-* *:00, *-*-* 00:00, Mon *-*-* 00:00 and *-*-01 00:00.
+        ("hourly", "0", "*", "*", "*"),
+        ("daily", "0", "0", "*", "*"),
+        ("weekly", "0", "0", "*", "1"),
+        ("monthly", "0", "0", "1", "*"),
+    ],
+)
+def test_a_word_means_the_same_date_for_cron_and_for_systemd(
+    rig: Rig, word: str, minute: str, hour: str, day_of_month: str, day_of_week: str
+) -> None:
+    fields = cron_line(installation(rig, schedule=word)).split()[:5]
+    assert fields == [minute, hour, day_of_month, "*", day_of_week]
 
 
 def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:

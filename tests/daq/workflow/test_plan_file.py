@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, load_plan, plan, save_plan, way_to_first_target
 from drivers.errors import MotionRefused
+from ident.model.urdf import read_urdf
 from ident.planning.clearance import Box
 
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
@@ -72,6 +74,54 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
     path.write_text(text + "  - {target_deg: [0, 12, 0, 0], velocity: 0.5, acceleration: 0.5}\n")
     with pytest.raises(ConfigurationInconsistent, match=r"moves\[1\], on the way there: found that the loops do not"):
         load_plan(path, cell)
+
+
+def _with_joint_renamed(cell: Cell) -> Cell:
+    name = read_urdf(cell.urdf).joints[2].name
+    return replace(cell, urdf=cell.urdf.replace(f'"{name}"', '"another"'))
+
+
+def _with_other_node(cell: Cell) -> Cell:
+    third = replace(cell.axes[2], node_id=33)
+    return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
+
+
+def _with_other_product(cell: Cell) -> Cell:
+    identity = cell.axes[2].identity
+    assert identity is not None
+    third = replace(cell.axes[2], identity=replace(identity, product_code=7))
+    return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
+
+
+OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str]] = {
+    "another joint": (_with_joint_renamed, r"what differs: joints \(names, kinds, parents or motors\);"),
+    "another node": (_with_other_node, r"what differs: drives \(node ids, vendors or product codes\);"),
+    "another product": (_with_other_product, r"what differs: drives \(node ids, vendors or product codes\);"),
+}
+
+
+@pytest.mark.parametrize("kind", OTHER_ROBOTS)
+def test_a_plan_of_another_robot_with_the_same_cell_name_is_refused(
+    kind: str, demo: Cell, made: Plan, tmp_path: Path
+) -> None:
+    change, message = OTHER_ROBOTS[kind]
+    other = change(demo)
+    assert other.name == demo.name
+    path = tmp_path / "plan.yaml"
+    save_plan(made, path)
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_plan(path, other)
+
+
+def test_a_plan_is_read_with_a_corrected_description(demo: Cell, made: Plan, tmp_path: Path) -> None:
+    first = demo.axes[0]
+    assert first.identity is not None
+    exchanged_drive = replace(first.identity, serial=9999)
+    axis = replace(first, zero_offset_rad=first.zero_offset_rad + 0.01, identity=exchanged_drive)
+    corrected = replace(demo, axes=(axis, *demo.axes[1:]), gravity_m_s2=(0.0, 0.1, -9.8))
+    path = tmp_path / "plan.yaml"
+    save_plan(made, path)
+    assert load_plan(path, corrected).robot == made.robot
 
 
 def test_a_plan_of_an_earlier_version_is_read(demo: Cell, tmp_path: Path) -> None:

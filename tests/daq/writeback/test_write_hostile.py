@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from daq.cli.app import main
+from daq.config.cell_file import load_cell
 from daq.documents import calibration_file
-from daq.errors import CalibrationMissing, ControllerUnfit, OutputFailed
-from daq.ledger.audit import AuditAction, Content, append, read, verify
+from daq.errors import CalibrationMissing, ControllerUnfit, ExitCode, OutputFailed
+from daq.ledger.audit import BACKUPS_WITHOUT_LOG, AuditAction, Content, append, head_file, read, verify
 from daq.writeback.file_target import FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose, rollback
@@ -185,3 +187,58 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
     assert "the audit log does not have that it is applied" in caplog.text
     (left,) = verify(audit).open_writes
     assert left.content is Content.AFTER
+
+
+def _write_and_delete_log(controller: Path, audit: Path) -> None:
+    """Apply a calibration, and remove the audit log of it with the note of its last entry."""
+    assert apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit) is not None
+    audit.unlink()
+    head_file(audit).unlink()
+
+
+def test_a_rollback_beside_a_deleted_log_works_and_the_new_log_says_what_is_missing(
+    controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    original = controller.read_bytes()
+    _write_and_delete_log(controller, audit)
+    assert caplog.text == ""
+    rollback(FileTarget(controller), NOW, audit=audit, who="Ada")
+    assert controller.read_bytes() == original
+    assert "is absent, although" in caplog.text
+    assert "1 backup of earlier writes" in caplog.text
+    begun, _ = read(audit)
+    assert begun.details[BACKUPS_WITHOUT_LOG] == 1
+    caplog.clear()
+    rollback(FileTarget(controller), NOW, audit=audit, who="Ada")  # the log is there again
+    assert caplog.text == ""
+    assert BACKUPS_WITHOUT_LOG not in read(audit)[-2].details
+
+
+def test_a_first_write_misses_no_log(controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    audit = tmp_path / "audit.jsonl"
+    apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit)
+    assert caplog.text == ""
+    assert all(BACKUPS_WITHOUT_LOG not in entry.details for entry in read(audit))
+
+
+def test_history_is_not_called_sound_where_backups_show_that_its_log_is_gone(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    not_histories = shutil.ignore_patterns("*.jsonl*", "*.sqlite*", "*.bak")
+    shutil.copytree(checkout / "configs", tmp_path / "configs", ignore=not_histories)
+    cell_file = tmp_path / "configs/cells/demo.yaml"
+    controller = load_cell(cell_file).controller_path
+    assert controller is not None
+    place = load_cell(cell_file).history
+    assert place is not None
+    _write_and_delete_log(controller, place.audit)
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
+    output = capsys.readouterr()
+    assert "1 backup of earlier writes beside it" in " ".join(output.err.split())
+    assert "sound" not in output.out
+    assert main(["history", str(cell_file), "--verify", "--json"]) == ExitCode.DATA_UNFIT
+    assert main(["rollback", str(cell_file), "--yes"]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert "an earlier log was removed or moved" in " ".join(capsys.readouterr().out.split())

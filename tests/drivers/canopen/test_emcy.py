@@ -37,4 +37,14 @@ def test_every_code_has_a_remedy_of_its_class() -> None:
     assert remedy_of(0x8611).startswith("check brake, load and collision")
     assert remedy_of(0x8130).startswith("check the bus's cable")
     assert remedy_of(0xFF01).startswith("see the drive's manual")
-    assert all("`CanopenNetwork.reset_faults`" in remedy_of(code) for code in CODES)
+    faults = [code for code in CODES if code > 0x00FF]
+    assert all("`CanopenNetwork.reset_faults`" in remedy_of(code) for code in faults)
+
+
+@pytest.mark.parametrize("code", [0x0000, 0x0001, 0x00FF])
+def test_a_code_of_no_error_asks_for_nothing(code: int) -> None:
+    assert remedy_of(code) == "nothing: the drive reports no error"
+
+
+def test_the_class_after_no_error_still_asks_for_a_reset() -> None:
+    assert "reset the fault" in remedy_of(0x1000)
