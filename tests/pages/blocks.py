@@ -1,7 +1,8 @@
 """Reads the code blocks of a page, and what the page's source says about them to the tests.
 
 A comment before a block, which readers do not see, is its mark: ``<!-- not run: REASON -->``, or
-``<!-- run by: FILE -->`` where a test of another room runs it. A comment that begins with ``<!-- before:`` has Python that stands for what the reader brings.
+``<!-- run by: FILE -->`` where a test of another room runs it. A comment that begins with
+``<!-- before:`` has Python that stands for what the reader brings.
 """
 
 from __future__ import annotations
