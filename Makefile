@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -22,6 +22,7 @@ help:
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings, screenshots in out/console; the certificate on paper"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
+	@echo "make test-docs  the Python of every page, and how many blocks and commands a test runs; a minute"
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
@@ -96,7 +97,7 @@ demo: setup
 	$(BIN)/drivegain demo --out out/demo
 
 test: check
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes"
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes" --ignore tests/pages
 
 test-processes: setup
 	$(BIN)/python -m pytest -q -m processes tests/pipeline tests/daq/jobs tests/faults tests/bench
@@ -136,6 +137,10 @@ check: setup
 
 docs: setup
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -d out/docs-doctrees docs out/docs
+
+test-docs: setup
+	$(BIN)/python -m tests.pages
+	$(BIN)/python -m pytest -q tests/pages
 
 # The pictures are committed: a build of the site runs no robot.
 screenshots: demo test-console

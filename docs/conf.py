@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+import tomllib
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 project = "drivegain"
+version = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 author = "The drivegain founders"
 copyright = author  # noqa: A001 - Sphinx reads this name
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "reference_pages"]
@@ -19,6 +21,7 @@ nitpicky = False
 
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "substitution"]
 myst_heading_anchors = 3
+myst_substitutions = {"version": version}
 # Console blocks of the tutorial name their terminal, which is no language: highlight only what a page asks for.
 highlight_language = "text"
 

@@ -11,6 +11,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,24 @@ SCHEMAS: dict[str, tuple[str, Any]] = {
 }
 """Title and model of each schema, by its name."""
 FRONT_DOORS = ("ident", "daq", "drivers")
+API_PAGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "data": ("ident", ("data.", "arrays.", "equations.")),
+    "model": ("ident", ("model.",)),
+    "identify": ("ident", ("estimators.", "physical.")),
+    "effects": ("ident", ("effects.", "discovery.")),
+    "calibration": ("ident", ("calibration.", "prediction.")),
+    "weighing": ("ident", ("weighing.", "contact.")),
+    "planning": ("ident", ("planning.",)),
+    "errors": ("ident", ("errors.",)),
+    "daq": ("daq", ("",)),
+    "drivers": ("drivers", ("",)),
+}
+"""Package, and rooms of it, that each page of the API describes."""
+NO_DOCSTRING = {
+    "ident.FloatArray": "A numpy array of float64.",
+    "drivers.CIA402": "The drive profile of CiA 402, without what a maker adds.",
+}
+"""What exported values are, which have no docstring of their own."""
 MARK = re.compile(r"^<!-- generated: ([a-z ]+) -->$", re.MULTILINE)
 
 
@@ -258,17 +277,49 @@ def _summary(thing: Any) -> str:
     return (inspect.getdoc(thing) or "").partition("\n")[0].rstrip(".")
 
 
-def api() -> str:
-    """The front doors: everything that `__all__` of each package exports."""
-    parts, described = [], set[str]()
-    for name in FRONT_DOORS:
-        exported = set(importlib.import_module(name).__all__)
-        members = "\n   :members:\n   :imported-members:"
-        if again := sorted(exported & described):  # `daq.Calibration` is `ident.Calibration`
-            members += f"\n   :exclude-members: {', '.join(again)}"
-        described |= exported
-        parts.append(f"## `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```")
-    return "\n\n".join(parts)
+def api_names(page: str) -> tuple[str, ...]:
+    """The exported names, with their package, that a page of the API describes."""
+    package, _ = API_PAGES[page]
+    names = []
+    for name in sorted(importlib.import_module(package).__all__):
+        home = _home(package, name)
+        if home.startswith(f"{package}.") and _page_of(package, home) == page:
+            names.append(f"{package}.{name}")
+    return tuple(names)
+
+
+def _home(package: str, name: str) -> str:
+    """The module that a name comes from; a type alias has none of its own."""
+    exported = getattr(importlib.import_module(package), name)
+    module = str(getattr(exported, "__module__", ""))
+    known = module.partition(".")[0] in FRONT_DOORS
+    return module if known else f"{package}.arrays" if package == "ident" else f"{package}.constants"
+
+
+def _page_of(package: str, module: str) -> str:
+    """The page with the longest room that the module is in."""
+    inside = module.removeprefix(f"{package}.")
+    fitting = []
+    for page, (owner, rooms) in API_PAGES.items():
+        if owner == package:
+            fitting += [(len(room), page) for room in rooms if f"{inside}.".startswith(room)]
+    return max(fitting)[1]
+
+
+def api(page: str) -> str:
+    """Everything that a page of the API describes: functions, then classes."""
+    functions, classes, others = [], [], []
+    for full_name in api_names(page):
+        package, _, name = full_name.partition(".")
+        exported = getattr(importlib.import_module(package), name)
+        if inspect.isclass(exported):
+            classes.append(f".. autoclass:: {full_name}\n   :members:")
+        elif inspect.isfunction(exported):
+            functions.append(f".. autofunction:: {full_name}")
+        else:
+            others.append(f".. py:data:: {full_name}\n\n   {NO_DOCSTRING[full_name]}")
+    directives = "\n\n".join([*functions, *classes, *others])
+    return f"```{{eval-rst}}\n{directives}\n```"
 
 
 def gates() -> str:
@@ -303,7 +354,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "cell file": cell_file,
     "schemas": schema_list,
     "errors": errors,
-    "api": api,
+    **{f"api {page}": partial(api, page) for page in API_PAGES},
     "gates": gates,
     "effects": effects,
 }

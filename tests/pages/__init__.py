@@ -1,0 +1,1 @@
+"""The commands and Python blocks of the documentation: which are run, and that those do."""
