@@ -156,7 +156,7 @@ def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) 
     return RewrittenGain(scalar.value / factor, number / factor, spelling)
 
 
-def paths_of(key: str, paths: Collection[KeyPath]) -> tuple[KeyPath, ...]:
+def dotted_paths(key: str, paths: Collection[KeyPath]) -> tuple[KeyPath, ...]:
     """Return every path in a file that reads as a dotted key: names of the file may have dots themselves.
 
     Args:
@@ -217,7 +217,7 @@ class ControllerDocument(ABC):
         Raises:
             ControllerUnfit: several places of the file read as this key.
         """
-        found = paths_of(key, _paths(self))
+        found = dotted_paths(key, _paths(self))
         if len(found) > 1:
             places = " and ".join(" / ".join(path) for path in found)
             raise self.unfit(key, f"{len(found)} places that read as this key: {places}", "rename one of them")
