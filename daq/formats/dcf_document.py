@@ -5,6 +5,9 @@ decimal to many a tool: it is refused, not guessed.
 
 An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `2003sub1`. Its number is the
 `ParameterValue` of its section. A data sheet (EDS) has none, and none is put there: that would be a new line.
+
+In compact storage an array has one section for all its elements: `[2003]` with `CompactSubObj`, the number of them. The
+values that differ from the default are in `[2003Value]`, each under its subindex.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ _VALUE = "parametervalue"
 _TYPE = "datatype"
 _OBJECT_TYPE = "objecttype"
 _VARIABLE = 7
+_COMPACT = "compactsubobj"
 _INTEGERS = {
     0x02: (8, True),
     0x03: (16, True),
@@ -39,6 +43,20 @@ _INTEGERS = {
 }
 """Bits and sign by the number of the type (CiA 301, table of data types)."""
 _REALS = (0x08, 0x11)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the number of an object is."""
+
+    described: DcfSection  #: says its type and limits
+    values: DcfSection  #: has its number
+    entry: str  #: the name of the number there
+
+    @property
+    def is_compact(self) -> bool:
+        """Whether it is an element of an array in compact storage."""
+        return self.values is not self.described
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +82,49 @@ class DcfDocument(ControllerDocument):
 
     def path_of(self, key: str) -> KeyPath:
         """Return section and entry of an object's value."""
-        return (self._section(sections_of(self.text), key).title, _VALUE)
+        place = self._place(sections_of(self.text), key)
+        return (place.values.title, place.entry)
 
-    def _section(self, sections: list[DcfSection], key: str) -> DcfSection:
+    def _place(self, sections: list[DcfSection], key: str) -> _Place:
         match = _KEY.fullmatch(key)
         if match is None:
             raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
         index = int(match[1], 16)
         subindex = int(match[2] or "0", 16)
+        compact = self._compact_place(sections, key, index, subindex)
+        if compact is not None:
+            return compact
+        section = self._section(sections, key, index, subindex, is_named=match[2] is not None)
+        return _Place(section, section, _VALUE)
+
+    def _compact_place(self, sections: list[DcfSection], key: str, index: int, subindex: int) -> _Place | None:
+        """Return where an element of an array in compact storage is; None where it has a section of its own."""
+        titles = [section.title for section in sections]
+        arrays = [section for section in sections if section.title == f"{index:04x}"]
+        if subindex == 0 or len(arrays) != 1 or f"{index:04x}sub{subindex:x}" in titles:
+            return None
+        array = arrays[0]
+        count = self._number({entry.name: entry for entry in array.entries}, key, _COMPACT, 0)
+        if count == 0:
+            return None
+        if subindex > count:
+            found = f"[{array.title}] with CompactSubObj={count}"
+            raise self.unfit(key, found, CORRECT_KEY, f"a subindex from 1 to {count}")
+        values = [section for section in sections if section.title == f"{array.title}value"]
+        if len(values) > 1:
+            lines = " and ".join(str(section.line) for section in values)
+            raise self.unfit(key, f"[{array.title}Value] {len(values)} times, on lines {lines}", "remove all but one")
+        if not values:
+            raise self.unfit(
+                key,
+                f"[{array.title}] in compact storage, without [{array.title}Value]",
+                f"give the device's DCF, or add [{array.title}Value] with the line `{subindex}=` and the current gain",
+            )
+        return _Place(array, values[0], str(subindex))
+
+    def _section(
+        self, sections: list[DcfSection], key: str, index: int, subindex: int, *, is_named: bool
+    ) -> DcfSection:
         found = [
             section
             for section in sections
@@ -79,7 +132,7 @@ class DcfDocument(ControllerDocument):
             and (int(title[1], 16), int(title[2] or "0", 16)) == (index, subindex)
         ]
         records = [section for section in found if self._is_record(section, key)]
-        if records and match[2] is None:
+        if records and not is_named:
             raise self.unfit(key, f"[{records[0].title}], an array or record", "name one of its subindices")
         # CiA 306 gives an array or record a section of its own beside that of its subindex 0.
         found = [section for section in found if section not in records]
@@ -101,15 +154,18 @@ class DcfDocument(ControllerDocument):
         return self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE
 
     def _locate(self, sections: list[DcfSection], key: str) -> Scalar:
-        section = self._section(sections, key)
-        names = Counter(entry.name for entry in section.entries)
-        doubled = sorted(name for name, count in names.items() if count > 1)
-        if doubled:
-            raise self.unfit(key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
-        entries = {entry.name: entry for entry in section.entries}
-        if self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE:
+        place = self._place(sections, key)
+        section = place.described
+        entries = self._entries(section, key)
+        if not place.is_compact and self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE:
             raise self.unfit(key, f"[{section.title}], an array or record", "name one of its subindices")
-        entry = entries.get(_VALUE)
+        entry = self._entries(place.values, key).get(place.entry)
+        if entry is None and place.is_compact:
+            raise self.unfit(
+                key,
+                f"[{section.title}Value] without {place.entry}, so the device has its default",
+                f"add the line `{place.entry}=` with the current gain there",
+            )
         if entry is None:
             raise self.unfit(
                 key,
@@ -137,6 +193,14 @@ class DcfDocument(ControllerDocument):
         except ValueError as error:
             raise self.unfit(key, where, "write a plain integer, decimal or 0x", "an integer of its type") from error
         return Scalar(key, float(value), entry.value, entry.start, entry.line, style)
+
+    def _entries(self, section: DcfSection, key: str) -> dict[str, DcfEntry]:
+        """Return the entries of a section by name; refuse one that has a name twice."""
+        names = Counter(entry.name for entry in section.entries)
+        doubled = sorted(name for name, count in names.items() if count > 1)
+        if doubled:
+            raise self.unfit(key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
+        return {entry.name: entry for entry in section.entries}
 
     def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""

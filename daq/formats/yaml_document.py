@@ -20,8 +20,8 @@ from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, 
 
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
 _MERGE = "<<"
-_TABS = re.compile(r"[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
-"""Tabs before a comment and at the end of a line: white space in YAML 1.2 (6.6) and to libyaml."""
+_TABS = re.compile(r"(?<=:)[ ]*\t[ \t]*|[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
+"""Tabs after a key, before a comment and at the end of a line: white space in YAML 1.2 (6.1, 6.6) and to libyaml."""
 _FLOAT = "tag:yaml.org,2002:float"
 
 

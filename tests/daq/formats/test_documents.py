@@ -494,6 +494,52 @@ def test_a_variable_with_two_sections_is_still_refused() -> None:
         document.locate(("2003",))
 
 
+_COMPACT = """\
+[2003]
+ParameterName=Gains
+ObjectType=0x8
+DataType=0x0008
+CompactSubObj=3
+[2003Name]
+NrOfEntries=1
+1=Gain of the motor
+[2003Value]
+NrOfEntries=2
+1=1.5
+3=32.5
+[2004]
+ObjectType=0x8
+DataType=0x0004
+CompactSubObj=2
+"""
+
+
+def test_an_element_of_an_array_in_compact_storage_is_changed_in_its_list_of_values() -> None:
+    document = DcfDocument("drive.dcf", _COMPACT)
+    assert [scalar.value for scalar in document.locate(("2003:01", "2003sub3"))] == [1.5, 32.5]
+    assert document.with_values({"2003:03": "33.0000"}).text == _COMPACT.replace("3=32.5", "3=33.0000")
+
+
+@pytest.mark.parametrize(
+    ("key", "says"),
+    [
+        ("2003:02", "[2003Value] without 2, so the device has its default"),
+        ("2003:04", "[2003] with CompactSubObj=3; expected a subindex from 1 to 3"),
+        ("2004:01", "[2004] in compact storage, without [2004Value]"),
+        ("2003", "[2003], an array or record"),
+    ],
+)
+def test_an_element_in_compact_storage_that_has_no_value_is_refused(key: str, says: str) -> None:
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", _COMPACT).locate((key,))
+    assert says in str(caught.value)
+
+
+def test_two_lists_of_values_of_one_array_are_refused() -> None:
+    with pytest.raises(ControllerUnfit, match=r"\[2003Value\] 2 times, on lines 9 and 17"):
+        DcfDocument("drive.dcf", _COMPACT + "[2003value]\n1=2.5\n").locate(("2003:01",))
+
+
 @pytest.mark.parametrize("value", ["$NODEID+0x10", "0x10+$NODEID", "$NodeId + 16"])
 def test_a_value_that_depends_on_the_node_is_refused_on_either_side(value: str) -> None:
     text = f"[2003]\nDataType=0x0004\nParameterValue={value}\n"

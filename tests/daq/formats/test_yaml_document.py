@@ -171,6 +171,15 @@ def test_tabs_behind_a_number_are_read_and_stay(gap: str, behind: str) -> None:
     assert document.with_values({"J1.gain": "33.10"}).text == text.replace("32.96", "33.10")
 
 
+@pytest.mark.parametrize("gap", ["\t", " \t", "\t\t ", " \t \t"])
+def test_tabs_between_a_key_and_its_number_are_read_and_stay(gap: str) -> None:
+    text = f"J1:\n  gain:{gap}32.96\nJ2: {{gain:{gap}-11.52}}\n"
+    document = decode_document(text.encode(), "robot.yaml")
+    assert [scalar.value for scalar in document.locate(("J1.gain", "J2.gain"))] == [32.96, -11.52]
+    changed = document.with_values({"J1.gain": "33.5000"})
+    assert changed.content == text.replace("32.96", "33.5000").encode()
+
+
 def test_a_tab_that_indents_is_still_no_yaml() -> None:
     with pytest.raises(ControllerUnfit, match="no YAML"):
         yaml_document(b"J1:\n\tgain: 32.96\n", "controller.yaml").locate(("J1.gain",))
