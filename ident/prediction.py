@@ -19,6 +19,7 @@ from ident.errors import DataUnfit, EffectNotInstalled, EffectRefused, ModelErro
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
+from ident.model.same_robot import foreign_base_parameter
 
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
@@ -156,11 +157,12 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     What a payload adds to friction is left out where the model has no friction by payload.
 
     Raises:
-        ModelError: a parameter is none of this robot's.
+        ModelError: a parameter is none of this robot's, or gathers others than this robot's geometry does.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     standard = np.zeros(len(index))
+    names: list[str] = []
     for parameter in calibration.parameters:
         if parameter.name in of_effects or ":" in parameter.name:
             continue
@@ -173,6 +175,14 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
                 f"{model.robot.joint_count} joints has {', '.join(index)}"
             )
         standard[index[leading]] = parameter.value
+        names.append(parameter.name)
+    foreign = foreign_base_parameter(model, names)
+    if foreign is not None:
+        raise ModelError(
+            f"the calibration of cell {calibration.cell!r} has the base parameter {foreign!r}, which another geometry "
+            "gathers; expected a calibration of the model's robot; give the model (URDF, gravity, drive train) that it "
+            "was fitted with"
+        )
     return standard
 
 

@@ -12,7 +12,9 @@ Consistent Inertial Parameter Identification, 2018). P is linear in the ten para
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import isfinite
 from numbers import Real
 
 import numpy as np
@@ -34,7 +36,8 @@ class Payload:
     """A weighed body as it was mounted; each mounting has its own unknowns.
 
     Raises:
-        ModelError: a name is not in LINK_PARAMETERS, or a value is no number.
+        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, or no body of positive mass has the
+            values, as far as enough of them are given to tell.
     """
 
     name: str  #: of the body
@@ -53,11 +56,46 @@ class Payload:
                 f"payload {self.name!r} has the known parameters {', '.join(map(repr, foreign))}; expected names among "
                 f"{', '.join(LINK_PARAMETERS)}; write its mass as {{'m': 4.59}}"
             )
+        contradiction = _contradiction(self.known)
+        if contradiction:
+            raise ModelError(
+                f"payload {self.name!r} has {contradiction}; expected values of a body, in SI units, the inertia about "
+                "the origin of the joint's frame (paper eq. 5); correct them, or give the mass alone"
+            )
 
     @property
     def known_parameters(self) -> FloatArray:
         """χ_kL in the order of LINK_PARAMETERS, zero where unknown, shape (10,)."""
         return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])
+
+
+_THIN = 1e-6  #: Extent of a body in a direction, as a share of that in all, below which it has none
+_SLACK = 1e-6  #: Share by which values that were rounded in a data sheet may miss those of a body
+
+
+def _contradiction(known: Mapping[str, float]) -> str:
+    """Say why no body of positive mass has some inertial parameters; empty where one has."""
+    for name, value in known.items():
+        if not isfinite(value):
+            return f"{name} = {value:g}"
+    if known.get("m", 1.0) <= 0.0:
+        return f"a mass of {known['m']:g} kg"
+    if not set(LINK_PARAMETERS[:6]) <= set(known):
+        return ""
+    matrix = pseudo_inertia(np.array([known.get(name, 0.0) for name in LINK_PARAMETERS]))
+    is_whole = set(LINK_PARAMETERS) <= set(known)
+    compared = matrix if is_whole else matrix[:3, :3]
+    diagonal = np.abs(np.diag(compared))
+    extent = max(float(diagonal[:3].sum()), float(np.finfo(np.float64).tiny))
+    # A point or a rod has no extent in some directions: there rounding is all that there is.
+    diagonal[:3] = np.maximum(diagonal[:3], _THIN * extent)
+    size = np.sqrt(diagonal)
+    least = float(np.linalg.eigvalsh(compared / np.outer(size, size))[0])
+    if least >= -_SLACK:
+        return ""
+    if float(np.linalg.eigvalsh(matrix[:3, :3])[0]) < -_SLACK * float(np.trace(matrix[:3, :3])):
+        return "moments of inertia of which one is below zero or above the sum of the other two"
+    return "an inertia that is too small for its mass so far from the joint's frame"
 
 
 def pseudo_inertia(link: FloatArray) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from ident.model.base import BaseParameters
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
 from ident.model.model import Model
 from ident.model.robot import Motion
+from ident.model.same_robot import TERM
 from ident.model.urdf import read_urdf
 from ident.physical.consistency import (
     MARGIN,
@@ -185,7 +185,6 @@ def inertia_prior(urdf: str) -> InertiaPrior:
 
 
 _SAME = 1e-4  #: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
-_TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 
 
 def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
@@ -249,7 +248,7 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     grouping = weights * scale / scale[list(independent), None]
     grouping[:, list(independent)] = np.eye(len(independent))
     for row, name in zip(grouping, ordered, strict=True):
-        for sign, size, other in _TERM.findall(name):
+        for sign, size, other in TERM.findall(name):
             declared = float(sign + size)
             found = float(row[index[other]]) if other in index else float("nan")
             if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):

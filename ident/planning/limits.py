@@ -16,7 +16,11 @@ POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its l
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointLimits:
-    """Limits of n joints [rad; m of a prismatic joint], shape (n,) each."""
+    """Limits of n joints [rad; m of a prismatic joint], shape (n,) each.
+
+    Raises:
+        ModelError: a limit is no array of finite numbers.
+    """
 
     lower: FloatArray  #: least positions
     upper: FloatArray  #: largest positions
@@ -31,7 +35,7 @@ class JointLimits:
 
     def __post_init__(self) -> None:
         for name in ("lower", "upper", "velocity", "acceleration"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+            object.__setattr__(self, name, as_array(f"limits.{name}", getattr(self, name)))
 
     def targets(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and the largest targets of a plan, which keep a margin from the limits."""

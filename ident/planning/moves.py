@@ -15,7 +15,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind
+from ident.arrays import FloatArray, as_array, require_kind, require_number
 from ident.data.conditioning import Conditioning
 from ident.errors import ModelError, PlanUnfit
 from ident.model.bodies import Payload
@@ -40,6 +40,9 @@ SHARPNESS = 8.0  #: Order of the norm of all deviations that a plan lowers, near
 NEAR_SHARE = 0.15  #: Standard deviation of the step to a near target, as a share of the range
 FEWEST_MOVES = 10  #: σ of a fit is found by leaving out moves
 MAX_TRIES = 100  #: Random moves from one place before its limits count as too narrow
+LONGEST_S = 3600.0  #: Of a run: a robot that moves for longer warms up
+MOST_EXCHANGES = 1_000_000  #: An hour of tries and more
+RATES_HZ = (1.0, 100_000.0)  #: Least and largest rate of set-points
 RUNS: tuple[int | None, ...] = (None, 0)  #: The moves are made without load, and with the payload
 PEAK_SPEED = 15.0 / 8.0  #: Largest speed of a move with least jerk, over its mean speed
 PEAK_ACCELERATION = 10.0 / 3.0**0.5  #: Its largest acceleration, over way / duration²
@@ -52,8 +55,9 @@ class PlannedMoves:
     target_rad: FloatArray  #: start, then the target of each move, shape (moves + 1, n)
     move_s: FloatArray  #: duration of each move, shape (moves,)
     dwell_s: float  #: rest at each target
-    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the payload, as
-    #: predicted from a nominal robot, shape (n,).
+    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the payload,
+    #: shape (n,). It is that of a nominal robot with the noise of a bad one: it compares plans, and a fit has usually
+    #: three to twelve times less.
     predicted_std_percent: FloatArray
 
     @property
@@ -66,7 +70,11 @@ class PlannedMoves:
 
         Args:
             rate_hz: sampling rate.
+
+        Raises:
+            ModelError: the rate is not in RATES_HZ.
         """
+        require_number("rate_hz", rate_hz, *RATES_HZ, "give the rate of the controller's set-points")
         time_s = np.arange(0.0, self.duration_s, 1.0 / rate_hz)
         begin_s = np.concatenate(([0.0], np.cumsum(self.move_s + self.dwell_s)[:-1]))
         move = np.searchsorted(begin_s, time_s, side="right") - 1
@@ -117,6 +125,7 @@ class _Search:
     effort: FloatArray  #: limit of each axis [Nm or N], inf where it is not known, shape (n,)
     row_s: float  #: time between two rows of the fit [s]
     edge_s: float  #: how long after a rest rows begin to count [s]
+    duration_s: float  #: of the run; no move is longer
 
     def fastest_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
         """Shortest duration of a move within the limits of velocity and acceleration [s]."""
@@ -126,7 +135,12 @@ class _Search:
         return float(max(by_velocity.max(), by_acceleration.max()))
 
     def information(self, start_rad: FloatArray, end_rad: FloatArray, move_s: float) -> FloatArray | None:
-        """Information of a move, without load and with the payload; None where a drive would not have the torque."""
+        """Information of a move, without load and with the payload; None where a drive would not have the torque.
+
+        None too where the move is longer than the run.
+        """
+        if move_s > self.duration_s:
+            return None
         time_s = np.arange(0.5 * self.row_s, move_s, self.row_s)
         if len(time_s) == 0:
             return None
@@ -201,7 +215,8 @@ def plan_moves(
         the moves, with the predicted standard deviation of each gain.
 
     Raises:
-        ModelError: an argument is of another type or shape, a limit is none, or the robot is a closed chain.
+        ModelError: an argument is of another type or shape or no such number, a limit is none, or the robot is a closed
+            chain.
         PlanUnfit: the duration has no room for enough moves, or some gain does not show in them.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
@@ -214,7 +229,9 @@ def plan_moves(
     if not gains.all():
         raise ModelError(f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing")
     limits.require_size(count)
-    search = _search_of(model, limits, payload, gains, urdf, conditioning or Conditioning())
+    require_number("duration_s", duration_s, 0.0, LONGEST_S, "give the duration of one run in seconds")
+    require_number("exchanges", exchanges, 0, MOST_EXCHANGES, "leave it out for 1000")
+    search = _search_of(model, limits, payload, gains, urdf, conditioning or Conditioning(), duration_s)
     rng = np.random.default_rng(seed)
     draft = _improved(search, _random_moves(search, rng, duration_s), rng, duration_s, exchanges)
     predicted = search.design.std_percent(np.sum(draft.information, axis=0))
@@ -229,7 +246,13 @@ def plan_moves(
 
 
 def _search_of(
-    model: Model, limits: JointLimits, payload: Payload, gains: FloatArray, urdf: str | None, conditioning: Conditioning
+    model: Model,
+    limits: JointLimits,
+    payload: Payload,
+    gains: FloatArray,
+    urdf: str | None,
+    conditioning: Conditioning,
+    duration_s: float,
 ) -> _Search:
     """What moves of a nominal robot are judged by."""
     fast_motion = _fast_motion(limits)
@@ -237,7 +260,8 @@ def _search_of(
     expectation, _ = nominal_expectation(model, urdf, gains, expected, limits, fast_motion)
     effort = believable_efforts(expectation, declared_efforts(model, urdf), fast_motion.position_rad, RUNS)
     row_s, edge_s = rows_between_rests(conditioning)
-    return _Search(Design(expectation, visible_base(model, fast_motion)), limits, effort, row_s, edge_s)
+    design = Design(expectation, visible_base(model, fast_motion))
+    return _Search(design, limits, effort, row_s, edge_s, duration_s)
 
 
 def _fast_motion(limits: JointLimits) -> Motion:

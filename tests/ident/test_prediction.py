@@ -28,7 +28,10 @@ from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
+from ident.model.model import Model
+from ident.model.urdf import robot_from_urdf
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
+from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, a_calibration, calibrated
 
 
@@ -185,7 +188,7 @@ def test_a_payload_that_the_calibration_does_not_know(identified: Evidence, payl
 
 def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Evidence) -> None:
     calibration, data = calibrated(identified), identified.datasets[1]
-    full = dict.fromkeys(PAYLOAD_TRUTH, 0.0)
+    full = dict.fromkeys(PAYLOAD_TRUTH, 0.0) | {"m": 1e-9}  # a speck
     weightless = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", full)))
     bare = predict_torque(calibration, identified.model, replace(data, payload=None))
     assert weightless == pytest.approx(bare)
@@ -278,3 +281,7 @@ def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None
     seventh = replace(calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")))
     with pytest.raises(ModelError, match="'Izz7"):
         predict_torque(seventh, identified.model, data)
+    longer = Model(robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), identified.model.drive_train)
+    for predict in (predict_torque, predict_current):
+        with pytest.raises(ModelError, match=r"which another geometry gathers; expected a calibration of the model's"):
+            predict(calibration, longer, data)

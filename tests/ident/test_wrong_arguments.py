@@ -45,6 +45,12 @@ OF_A_RUN: list[tuple[str, Change, str]] = [
     ("no position", lambda r: replace(r, position_rad=None), "'bare': position_rad .*expected"),
     ("valid of samples", lambda r: replace(r, valid=np.ones(len(r.time_s))), r"'bare': valid has shape .* expected \("),
     ("few moves", lambda r: replace(r, move=np.zeros(9)), r"'bare': move has shape \(9,\); expected \(\d+,\)"),
+    (
+        "masked currents",
+        lambda r: replace(r, current_a=np.ma.masked_greater(r.current_a, 0.0)),
+        "'bare': current_a masks some of its values; expected a number for each",
+    ),
+    ("complex positions", lambda r: replace(r, position_rad=r.position_rad + 0j), "position_rad holds complex numbers"),
     ("a mass for the payload", lambda r: replace(r, payload=4.0), "'bare' is of type float; expected Payload; write"),
 ]
 

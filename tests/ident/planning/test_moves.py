@@ -106,7 +106,7 @@ def test_torques_keep_the_efforts_of_the_urdf(model: ident.Model, plan: ident.Pl
     weak = EXAMPLE.URDF.replace('effort="99"', 'effort="60"')
     moves = ident.plan_moves(model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, urdf=weak, exchanges=20)
     gains = np.array(EXAMPLE.NAMEPLATE_NM_A)
-    search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, weak, ident.Conditioning())
+    search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, weak, ident.Conditioning(), 40.0)
     assert np.isfinite(search.effort).all()
 
     def largest(planned: ident.PlannedMoves) -> float:
@@ -155,6 +155,33 @@ WRONG: list[tuple[str, Call, str]] = [
         r"found room for \d moves in 5 s; expected at least 10, and better 30; give a longer `duration_s`",
     ),
     (
+        "endless",
+        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=float("inf")),
+        "duration_s is inf; expected a number from 0 to 3600; give the duration of one run in seconds",
+    ),
+    (
+        "no number",
+        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=float("nan")),
+        "duration_s is nan; expected a number",
+    ),
+    (
+        "text",
+        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], exchanges="many"),
+        "exchanges is 'many'; expected a number from 0",
+    ),
+    (
+        "slow as a glacier",
+        lambda m: lax.plan_moves(
+            m, lax.JointLimits(LIMITS.lower, LIMITS.upper, [1e-9] * 3, LIMITS.acceleration), EXAMPLE.DISC, [1, 1, 1]
+        ),
+        "found room for 0 moves in 40 s",
+    ),
+    (
+        "limits of words",
+        lambda m: lax.JointLimits(["low"], ["high"], [1], [1]),
+        "limits.lower is no array of numbers",
+    ),
+    (
         "no mass",
         lambda m: lax.plan_moves(m, LIMITS, lax.Payload("disc", "flange", {}), [1, 1, 1], exchanges=0),
         r"found gains that \d+ moves do not show: J1, J2, J3; .* a payload with a mass",
@@ -166,3 +193,9 @@ WRONG: list[tuple[str, Call, str]] = [
 def test_what_no_plan_can_be_made_of_is_refused(model: ident.Model, call: Call, words: str) -> None:
     with pytest.raises(ident.IdentificationError, match=words):
         call(model)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -5.0, float("nan"), 1e9])
+def test_set_points_at_no_rate_are_refused(plan: ident.PlannedMoves, rate_hz: float) -> None:
+    with pytest.raises(ident.IdentificationError, match=r"rate_hz is .*; expected a number from 1 to 100000"):
+        plan.motion(rate_hz)

@@ -1,0 +1,84 @@
+"""Whether base parameters that were identified can be those of a robot.
+
+Some changes of the standard parameters leave every torque as it is: W_st N = 0, whatever the motion (paper §2.1). Base
+parameters β = G χ_st do not change with them, so G N = 0. That holds of any data of the robot, also of data that
+determine fewer base parameters than the robot has; N depends on the lengths, twists and kinds of joints, and another
+robot's is another.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.arrays import FloatArray
+from ident.model.bodies import LOADED
+from ident.model.model import Model
+from ident.model.robot import Motion
+
+STATES = 60  #: States on which W_st is computed; each gives a row for every joint
+RANGE = 1.5  #: Positions, speeds and accelerations are drawn from ± this [rad or m, s]
+RANK_TOLERANCE = 1e-9  #: Singular values below this share of the largest are rounding error
+WEIGHT_TOLERANCE = 1e-3
+"""Share of a weight that may differ. Filtered data determine it to four digits; a length that differs by a millimetre
+in a metre is the correction of a description, not another robot."""
+ROUNDED = 2e-6  #: Weights are written with six decimals, and left out below
+TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
+"""A standard parameter that a base parameter gathers, in its name: " + 0.4*m3"."""
+
+
+def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
+    """Return the base parameter that contradicts a robot most; None where they can be this robot's.
+
+    Closed chains are not compared: their regressor needs a motion on which the loops close. Nor is what a payload adds
+    to friction, which no geometry changes.
+
+    Args:
+        model: of the robot.
+        names: of the base parameters, each a leading standard parameter of this model and what it gathers.
+    """
+    compared = [name for name in names if not name.split(" ", 1)[0].endswith(LOADED)]
+    if model.robot.closures or not compared:
+        return None
+    kept = [number for number, column in enumerate(model.columns) if not column.name.endswith(LOADED)]
+    regressor = model.regressor(_drawn_states(model.robot.axis_count))[:, kept]
+    rows = regressor.transpose(0, 2, 1).reshape(-1, len(kept))
+    size = np.linalg.norm(rows, axis=0)
+    is_seen = size > RANK_TOLERANCE * float(size.max())
+    scale = np.where(is_seen, size, 1.0)
+    invisible = _null_space(rows / scale)
+    leading, weights = _weights(compared, [model.columns[number].name for number in kept])
+    by_torque = scale[leading, None] / scale  # weights for columns of unit size
+    change = np.linalg.norm((weights * by_torque) @ invisible, axis=1)
+    is_gathered = weights != 0.0
+    allowed = is_gathered * WEIGHT_TOLERANCE * np.maximum(1.0, np.abs(weights)) + is_seen * ROUNDED
+    excess = change / np.linalg.norm(allowed * by_torque, axis=1)
+    worst = int(np.argmax(excess))
+    return compared[worst] if excess[worst] > 1.0 else None
+
+
+def _weights(names: Sequence[str], columns: Sequence[str]) -> tuple[list[int], FloatArray]:
+    """Read names of base parameters: the index of each leading column, and G, shape (b, c)."""
+    index = {name: number for number, name in enumerate(columns)}
+    leading = [index[name.split(" ", 1)[0]] for name in names]
+    weights = np.zeros((len(names), len(columns)))
+    for row, (first, name) in enumerate(zip(leading, names, strict=True)):
+        weights[row, first] = 1.0
+        for sign, number, other in TERM.findall(name):
+            if other in index:
+                weights[row, index[other]] = float(sign + number)
+    return leading, weights
+
+
+def _drawn_states(axis_count: int) -> Motion:
+    drawn = np.random.default_rng(0).uniform(-RANGE, RANGE, (3, STATES, axis_count))
+    return Motion(drawn[0], drawn[1], drawn[2])
+
+
+def _null_space(rows: FloatArray) -> FloatArray:
+    """Orthonormal N with rows @ N = 0, shape (m, c) → (c, c - rank)."""
+    _, singular, right = np.linalg.svd(rows, full_matrices=True)
+    rank = int(np.count_nonzero(singular > RANK_TOLERANCE * singular[0]))
+    return np.asarray(right[rank:].T)
