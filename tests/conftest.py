@@ -23,7 +23,7 @@ settings.load_profile("drivegain")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 
-LONG = ("test_main_job.py", "test_any_robot.py", "test_tx40.py")
+LONG = ("test_main_job.py", "test_same_diagnoses.py", "test_plan_effort.py", "test_guided.py", "test_any_robot.py")
 """Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
 
 
@@ -31,6 +31,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register what `make test` leaves to a target of its own."""
     config.addinivalue_line(
         "markers", "processes: a whole job: on several processes or buses, or a real recording (make test-processes)"
+    )
+    config.addinivalue_line(
+        "markers", "slow: searches, plans and sessions on whole simulated recordings (make test-slow)"
     )
     config.addinivalue_line(
         "markers", "browser: drives Chromium, where DRIVEGAIN_CHROMIUM names it (make test-console)"

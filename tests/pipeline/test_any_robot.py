@@ -10,6 +10,8 @@ from daq.errors import ExitCode
 from daq.log.conversion import load_run
 from tests.pipeline.cells import Job, fit_job, record_job
 
+pytestmark = pytest.mark.slow
+
 ROBOTS = ("seven-axis", "gantry")
 
 

@@ -20,6 +20,8 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, with_gravity
 
+pytestmark = pytest.mark.slow
+
 
 def _run(folder: Path, name: str) -> Run:
     table = np.loadtxt(folder / f"kr300_{name}.csv", delimiter=",")

@@ -11,6 +11,8 @@ from daq.documents.calibration_file import load_calibration
 from daq.errors import ExitCode
 from tests.pipeline.next_step import next_step
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tx40_log(tmp_path_factory: pytest.TempPathFactory, checkout: Path, shared_data: Path) -> bytes:

@@ -24,6 +24,8 @@ from daq.errors import ExitCode
 from ident.calibration import Calibration
 from ident.errors import EffectNotInstalled
 
+pytestmark = pytest.mark.slow
+
 COSINE_NM = 3.0
 SINE_NM = 1.5
 SCREWS = 3

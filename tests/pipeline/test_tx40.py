@@ -13,6 +13,8 @@ import pytest
 from daq.cli.app import main
 from daq.errors import ExitCode
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tx40(shared_data: Path, checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -23,6 +23,8 @@ from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
+pytestmark = pytest.mark.slow
+
 NEEDS_PERSON, BY_THE_JOB = (
     {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}} for by in ("person", "job")
 )

@@ -39,6 +39,8 @@ from ident.errors import DataUnfit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
 from tests.daq.logs import content, samples, write
 
+pytestmark = pytest.mark.slow
+
 CELLS = 4
 WITH_HOLDOUT = 1
 """Of them; the others have one run without load and one with."""

@@ -63,6 +63,8 @@ from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
 from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
 
+pytestmark = pytest.mark.slow
+
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network", "geometry"})
 """Tools between which a session reads and writes its own files; the clock is read beside each of them, gains that are
 in a file need no network, and the geometry is judged only where a block shows a mistake."""

@@ -35,6 +35,8 @@ from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from tests.ident.recordings import GAINS, MOUNTED, PAYLOAD_TRUTH, record, tx40_truth
 
+pytestmark = pytest.mark.slow
+
 CREATED = datetime(2025, 1, 2, tzinfo=UTC)
 PLATE = Payload("plate", "b")
 """The same body as the disc, of which the log says nothing: a fit that finds its mass finds 4.59 kg."""

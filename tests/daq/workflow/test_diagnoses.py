@@ -24,6 +24,8 @@ from ident.estimators.method import Method
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import MOUNTED, record, tx40_truth
 
+pytestmark = pytest.mark.slow
+
 WHEN = datetime(2025, 1, 2, tzinfo=UTC)
 FIT = [Path("run0"), Path("run1")]
 CROSSED = [0, 2, 1, 3, 4, 5]

@@ -26,6 +26,8 @@ from ident.prediction import measured_torque
 from tests.conftest import CHECKOUT
 from tests.daq.robot_calibrations import CalibratedRobot, apart, calibrated_robot, robot_of
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 SERIAL = ("kr270", "seven-axis", "gantry", "tx40")
 CLOSED = ("five-bar", "orthoglide", "dualv")

@@ -40,6 +40,8 @@ from ident.model.model import Column
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import RECORDED
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 CELL = load_cell(CHECKOUT / "configs/cells/dualv.yaml")
 GAINS = np.array([7.3, 6.8, -7.1, -7.5])

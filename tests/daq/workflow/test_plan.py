@@ -22,6 +22,8 @@ from drivers.move import Trapezoid
 from ident.planning.clearance import BASE, Box, Capsule
 from ident.planning.excitation import Design
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
 TIGHT = Clearance(

@@ -20,6 +20,8 @@ from drivers.simulation.plant import link_model, motor_rows
 from drivers.simulation.spec import CellSpec, FloatArray
 from ident.planning.effort import EFFORT_MARGIN
 
+pytestmark = pytest.mark.slow
+
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
 TRIPPED = (500, 902)  #: Seeds of plans on which J2 of the RX-90 had a following error when no torque was looked at
 

@@ -23,6 +23,8 @@ from drivers.errors import MotionRefused
 from ident.model.urdf import read_urdf
 from ident.planning.clearance import Box
 
+pytestmark = pytest.mark.slow
+
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
 OLD = """format: drivegain-plan
 cell: demo

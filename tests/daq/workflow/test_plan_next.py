@@ -18,6 +18,8 @@ from daq.workflow.plan import Plan, PlanGoal, TargetBox, plan
 from ident.planning.gain_verdict import verdicts
 from ident.planning.target import SlowCause, recorded_information, slow_cause
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
 POOR = 3  #: Axis J4, which rests in all moves so far

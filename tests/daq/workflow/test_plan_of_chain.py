@@ -18,6 +18,8 @@ from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan
 from ident.planning.gain_verdict import Hidden, verdicts
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 9.0
 
 

@@ -50,6 +50,8 @@ from tests.ident.mistaken import small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, record, three_axes_truth
 from tests.remembered import remembered
 
+pytestmark = pytest.mark.slow
+
 WHEN = datetime(2025, 1, 2, tzinfo=UTC)
 CELL = """\
 name: three

@@ -18,6 +18,8 @@ from drivers.errors import MotionRefused
 from ident.model.urdf import robot_from_urdf
 from ident.planning.clearance import Box, Checker
 
+pytestmark = pytest.mark.slow
+
 LEFT = (1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: The arm, stretched forward, beside a wall in front of it
 RIGHT = (-1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: On its other side: the straight way there swings through it
 ABOVE = (0.0, -0.5, 0.0, 0.0, 0.0, 0.0)

@@ -18,6 +18,8 @@ from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, NonlinearViscous, SpeedFriction, Stribeck
 from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, three_axes_truth
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 AXIS = 1

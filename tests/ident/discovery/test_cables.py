@@ -19,6 +19,8 @@ from ident.effects.effect import PlacedEffect, is_placeable
 from ident.effects.position import Cable, Compensator, Hinge, SlackCable, Spring
 from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, three_axes_truth
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 OF_POSITION = tuple(

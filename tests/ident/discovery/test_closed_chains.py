@@ -32,6 +32,8 @@ from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, PLANAR, THREE_LEGS, Mechanism
 from tests.ident.recordings import search_problem_of
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 Torque = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]

@@ -30,6 +30,8 @@ from tests.ident.balanced import (
     heavy_runs,
 )
 
+pytestmark = pytest.mark.slow
+
 GATES = Gates(draws=99)
 LIKE_IT = tuple(family for family in EFFECTS if family[0].name in ("counterbalance", "gravity-compensator", "spring"))
 JOINTS = ("J1", "J2", "J3", "J4", "J5", "J6")

@@ -28,6 +28,8 @@ from tests.ident.recordings import (
     search_problem_of,
 )
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 SPREAD = 0.02  #: Standard deviation of each axis' friction from run to run

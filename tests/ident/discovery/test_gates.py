@@ -55,6 +55,8 @@ from ident.model.model import Column
 from tests.ident.loops import record_in_loop
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, acting_on, bent, search_problem_of, whole
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 EITHER_SIGN = {

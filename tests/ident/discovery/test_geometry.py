@@ -41,6 +41,8 @@ from tests.ident.recordings import (
     three_axes_truth,
 )
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 GATES = Gates(draws=199)

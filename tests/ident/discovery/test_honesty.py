@@ -20,6 +20,8 @@ from ident.effects.friction import PositionFriction, Stribeck
 from ident.equations.linearisation import Folds, Linearisation, cut_into_folds, linearise
 from tests.ident.recordings import search_problem_of, with_current
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 KNOWN = ("nonlinear-viscous", "load-friction")

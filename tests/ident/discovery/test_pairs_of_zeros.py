@@ -6,12 +6,15 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from ident.data.run import Run
 from ident.discovery.gates import Gates
 from ident.discovery.geometry_check import check_geometry
 from ident.effects.geometry_corrections import ZeroOffset
 from tests.ident.recordings import MOUNTED, gathered, record, tx40_truth
+
+pytestmark = pytest.mark.slow
 
 OPPOSITE_RAD = np.array([0.0, 1.0, -1.0, 0.0, 0.0, 0.0]) * np.radians(5.0)
 GATES = Gates(draws=199)

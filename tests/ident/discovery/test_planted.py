@@ -40,6 +40,8 @@ from tests.ident.recordings import (
     with_current,
 )
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 PAUSE_S = 40.0

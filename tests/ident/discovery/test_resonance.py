@@ -23,6 +23,8 @@ from ident.effects.twist import DrivenLink, Gears, spring_torque, twists
 from ident.model.robot import Motion
 from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, training_error
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 AXIS, COMPLIANCE, RATIO = 1, 8.0e-4, 0.2  # a resonance a few times as fast as the moves

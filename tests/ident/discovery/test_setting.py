@@ -20,6 +20,8 @@ from ident.effects.friction import AsymmetricViscous, Stribeck, WarmUp
 from ident.effects.position import Hinge, Spring
 from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 

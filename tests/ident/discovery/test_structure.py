@@ -22,6 +22,8 @@ from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
 from tests.ident.recordings import Truth, acting_on, bent, search_problem_of, training_error
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 Torque = Callable[[Dataset], FloatArray]
 GATES = Gates(draws=199)

@@ -18,6 +18,8 @@ from ident.effects.twist import DrivenLink, Gears, link_of, torque_of_twist, twi
 from ident.model.robot import Motion
 from tests.ident.recordings import search_problem_of
 
+pytestmark = pytest.mark.slow
+
 RATE_HZ = 1000.0
 INERTIA_KG_M2 = 0.2
 DRY_NM = 4.0

@@ -24,6 +24,8 @@ from ident.model.model import Column
 from tests.ident.closed_recordings import Made, recorded
 from tests.ident.mechanisms import FIVE_BAR, MECHANISMS, PLANAR, Mechanism
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(10, 15)
 NOISE_A = 0.03
 

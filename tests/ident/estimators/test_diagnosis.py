@@ -38,6 +38,8 @@ from ident.plausible import UNIT_RATIO, WEIGHT_RATIO
 from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def clean(small_truth: Truth) -> list[Run]:

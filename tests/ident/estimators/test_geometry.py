@@ -25,6 +25,8 @@ from ident.model.geometry_derivatives import model_with_geometry
 from tests.ident.closed_recordings import RATE_HZ, axis_positions
 from tests.ident.mechanisms import FIVE_BAR, PLANAR
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 NOISE_RAD = 5e-6  #: of a count of 2⁻¹⁶ turns of a motor behind a gear of 5, as of the shipped redundant robot
 PARAMETERS = geometry_parameters(PLANAR.robot)

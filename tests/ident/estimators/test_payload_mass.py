@@ -19,6 +19,8 @@ from ident.estimators.payload_mass import mass_responses
 from ident.model.bodies import Payload
 from tests.ident.recordings import CONDITIONING, MOUNTED, PAYLOAD_TRUTH, Truth, record
 
+pytestmark = pytest.mark.slow
+
 STEP = 0.01  #: Share of the mass between the refits and the fit
 DRAWING = {name: PAYLOAD_TRUTH[name] for name in ("m", "mx", "my", "mz")}
 METHODS = [("ml", 0.005), ("iv", 0.005), ("ls", 0.02), ("wls", 0.02), ("tls", 0.02)]

@@ -23,6 +23,8 @@ from ident.estimators.turned_geometry import (
 from tests.ident.mistaken import AXES, SMALL, small_recordings, with_currents
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record, three_axes_truth
 
+pytestmark = pytest.mark.slow
+
 DOWN = np.array([0.0, 0.0, -9.81])
 
 

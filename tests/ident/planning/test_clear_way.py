@@ -16,6 +16,8 @@ from ident.planning.clearance import Box, Capsule, Checker, Scene
 from tests.ident.arms import TX40
 from tests.ident.mechanisms import PLANAR
 
+pytestmark = pytest.mark.slow
+
 LIMIT = np.array([2.5, 1.5, 1.5, 1.0, 1.0, 1.0])
 STRETCHED = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
 """The wrist is 0.45 m in front of the arm and 0.34 m high; the first joint turns it to the left or right."""
