@@ -266,6 +266,8 @@ SAME_NAME: dict[str, tuple[Callable[[str], str], str]] = {
 }
 OF_ANOTHER_ROBOT: dict[str, tuple[list[str], ExitCode]] = {
     "validate": (["validate", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
+    "export csv": (["export", "csv", "CALIBRATION", "LOG", "--out", "out.csv"], ExitCode.DATA_UNFIT),
+    "console": (["console", "CELL", "--calibration", "CALIBRATION"], ExitCode.DATA_UNFIT),
     "weigh": (["weigh", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
     "contact": (["contact", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
     "certificate": (["certificate", "CALIBRATION", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
