@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # the names of a module stand together
     from ident.arrays import FloatArray as FloatArray
     from ident.calibration import (
         AcceptedEffect as AcceptedEffect,
+        CalibratedDrive as CalibratedDrive,
+        CalibratedJoint as CalibratedJoint,
+        CalibratedRobot as CalibratedRobot,
         Calibration as Calibration,
         EncoderMisfit as EncoderMisfit,
         Gain as Gain,

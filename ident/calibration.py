@@ -195,6 +195,36 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibratedJoint:
+    """A joint of the robot that a calibration is of."""
+
+    name: str  #: as in the robot's description
+    kind: str  #: revolute or prismatic
+    parent: str  #: name of the joint before it, empty on the base
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedDrive:
+    """A drive of the robot that a calibration is of; None for a number that its description leaves open."""
+
+    axis: str  #: name of the axis
+    node_id: int | None
+    vendor_id: int | None
+    product_code: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedRobot:
+    """The robot that a calibration is of: what tells it from another one of the same name and axes."""
+
+    kinematics_sha256: str  #: of joints, their kinds and order, and the motors of a closed chain, hex; as in a plan
+    drives_sha256: str  #: of node id, vendor and product code of each axis, hex; as in a plan
+    joints: tuple[CalibratedJoint, ...]  #: that move, in the order of the description
+    drives: tuple[CalibratedDrive, ...]  #: one an axis
+    motors: tuple[str, ...] = ()  #: joints with a motor in a closed chain; empty for a serial robot
+
+
+@dataclass(frozen=True, slots=True)
 class Calibration:
     """Gains, parameters and effects of a cell, with their errors and sources."""
 
@@ -238,6 +268,8 @@ class Calibration:
     encoder_misfit: EncoderMisfit | None = None
     #: All standard parameters under a prior; None where none was asked for, and in calibrations of earlier versions.
     full_parameters: FullSet | None = None
+    #: The robot that it is of; None of arrays, where nothing describes it, and in calibrations of earlier versions.
+    robot: CalibratedRobot | None = None
     #: Effects of one's own that were given as an argument, one of each name or more: predictions find them here. No
     #: file has them; give them again to `daq.load_calibration`. An installed package needs no argument.
     own_effects: tuple[Effect, ...] = field(default=(), compare=False, repr=False)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -59,6 +61,11 @@ def history_verb(
         bool,
         typer.Option("--migrate", "--rebuild", help="Take the SQLite file of earlier versions into the audit."),
     ] = False,
+    rename: Annotated[
+        str | None,
+        typer.Option("--rename", metavar="OLD", help="The cell was called OLD: take its history and sessions over."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="With --rename: do it; without it, it is only shown.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
@@ -85,16 +92,13 @@ def history_verb(
             str(cell), found="no history", expected="a cell file", remedy="give the cell file, not a log"
         )
     _check_files(plot, csv)
-    if acknowledge is None and (why is not None or since is not None or by is not None):
-        raise UsageError(
-            "--by, --why, --since",
-            found="no --acknowledge",
-            expected="them with --acknowledge AXIS",
-            remedy="name the axis whose change is explained",
-        )
+    _check_companions("--acknowledge AXIS", acknowledge, {"--by": by, "--why": why, "--since": since})
+    _check_companions("--rename OLD", rename, {"--yes": yes or None})
     now = datetime.now(UTC)
     who = str(applier(by if acknowledge is not None else None))
     _migrate(ledger, who, now, forced=migrate)
+    if rename is not None:
+        _rename(ledger, cell, rename, who, now, confirmed=yes)
     if add is not None:
         _add(ledger, add, who, now)
     checked, history, all_series = _read(ledger, verify)
@@ -103,6 +107,7 @@ def history_verb(
         checked, history, all_series = _read(ledger, verify)
     if checked is None and history.may_lack:
         _LOG.warning(MAY_LACK)
+    _say_names(history, cell)
     chosen = all_series if axis is None else (_named(all_series, axis, declared),)
     _write_files(chosen, declared, plot, csv)
     current = in_force(declared, history)
@@ -112,7 +117,7 @@ def history_verb(
         resolve_links(declared.controller_path)
     console = output_console()
     if json:
-        print_json(history_report(declared.name, history.entries, chosen, all_series, current, checked))
+        print_json(history_report(declared.name, history, chosen, all_series, current, checked))
     else:
         if checked is not None:
             _require_log(ledger, checked)  # before the page calls the history sound
@@ -125,6 +130,18 @@ def history_verb(
     if checked is not None:
         _require(ledger, checked)
         _require_log(ledger, checked)
+
+
+def _check_companions(option: str, given: str | None, companions: Mapping[str, object | None]) -> None:
+    """Refuse options that mean something beside another one only."""
+    lonely = [name for name, value in companions.items() if value is not None]
+    if given is None and lonely:
+        raise UsageError(
+            ", ".join(lonely),
+            found=f"no {option.split(maxsplit=1)[0]}",
+            expected=f"it with {option}",
+            remedy=f"give {option}, too",
+        )
 
 
 def _require_log(ledger: Ledger, checked: Verification) -> None:
@@ -239,6 +256,80 @@ def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
     say(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
     if done.flaws:
         say(f"The old history was broken ({_first(done.flaws)}): what only it had was not taken over.", err=True)
+
+
+def _say_names(history: History, cell_file: Path) -> None:
+    """Say which calibrations are of another robot, and where those of this one may be."""
+    for foreign in history.other_robots[:_SHOWN]:
+        _LOG.warning("%s; no change of a gain is computed with it", printable(str(foreign)))
+    more = len(history.other_robots) - _SHOWN
+    if more > 0:
+        _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
+    if history.renamed is not None:
+        _LOG.warning(
+            "this cell was renamed: found the name %r, expected %r, since %s; give the cell file with that name",
+            history.renamed.old,
+            history.renamed.new,
+            history.renamed.at,
+        )
+    for name in history.possible_names:
+        command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"
+        _LOG.warning(
+            "this cell has no calibration here, and cell %r, of a robot with the same joints and drives, has; if this "
+            "is that robot under a new name: `%s`",
+            printable(name),
+            command,
+        )
+
+
+def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, *, confirmed: bool) -> None:
+    """Take the history and the sessions of a cell's earlier name over; without `confirmed`, say what that would be."""
+    from daq.jobs.position import sessions_folder
+    from daq.jobs.session import rename_sessions, sessions_to_rename
+    from daq.jobs.units import unit_name
+    from daq.ledger.ledger import plan_rename, rename_cell
+    from daq.workflow.bus_lock import bus_lock
+
+    cell = ledger.cell
+    if old == cell.name:
+        raise UsageError(
+            "--rename",
+            found=f"{old!r}, the name in {cell_file}",
+            expected="the name that the cell had before",
+            remedy="write the new name into the cell file (`name:`) first, then give the old one here",
+        )
+    folders = {sessions_folder(cell_file)}
+    if cell.recalibration is not None:
+        folders.add(cell.recalibration.folder)
+    with bus_lock(cell):  # a job that runs would write its state under the old name again
+        planned = plan_rename(ledger, old)
+        until = planned.entered_at or now
+        count = sum(len(sessions_to_rename(folder, old, until)) for folder in folders)
+        taken = ", ".join(
+            (
+                counted(planned.calibrations, "calibration"),
+                counted(planned.writes, "write"),
+                counted(planned.acknowledgements, "explained change"),
+                counted(count, "session"),
+            )
+        )
+        if planned.undescribed:
+            say(
+                f"{counted(planned.undescribed, 'calibration')} of earlier versions do not say of which robot: the "
+                "names of the axes are the same, and nothing else could be compared.",
+                err=True,
+            )
+        if not confirmed:
+            say(f"Would rename {old!r} to {cell.name!r}: {taken}. Nothing was changed; --yes does it.", err=True)
+            return
+        rename_cell(ledger, planned, who=who, at=now)
+        rename_sessions(folders, old, cell.name, until)
+    say(f"Renamed {old!r} to {cell.name!r}: {taken}.", err=True)
+    say(
+        "Logs, plans and calibration files keep the old name: make new ones. A schedule of the old name "
+        f"({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: drivegain schedule.",
+        err=True,
+    )
 
 
 def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime) -> None:

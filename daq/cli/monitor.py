@@ -105,6 +105,7 @@ def console_verb(
     from daq.console.live import Live
     from daq.console.results import Results
     from daq.console.server import Page, listen, new_token, server_of
+    from daq.workflow.validate import check_cell
 
     declared = read_cell(cell)
     if report is not None and not report.is_dir():
@@ -116,6 +117,8 @@ def console_verb(
         )
     results = Results(cell, declared, calibration, report)
     known = results.calibration() if calibration is None else (calibration, read_calibration(calibration))
+    if calibration is not None and known is not None:
+        check_cell(known[1], cell, declared)
     live = Live(cell, declared)
     live.calibration = None if known is None else known[1]
     beside = []

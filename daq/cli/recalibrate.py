@@ -52,6 +52,8 @@ def recalibrate_verb(
         journal.say(Level.ERROR, "interrupted", axes="; ".join(stop_notes(interrupt)) or "stopped")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except (DaqError, DriverError, IdentificationError) as error:
+        if journal.form is Form.TEXT:
+            raise  # a terminal gets the message once, with its parts
         journal.say(
             Level.ERROR,
             "failed",
@@ -59,8 +61,6 @@ def recalibrate_verb(
             text=for_command_line(str(error)),
             notes=list(all_notes(error)),
         )
-        if journal.form is Form.TEXT:
-            raise
         # A program reads stderr, and the message for the terminal is no line of JSON.
         raise typer.Exit(exit_code(type(error)) or ExitCode.UNEXPECTED) from error
 

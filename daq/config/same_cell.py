@@ -11,12 +11,13 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import zip_longest
 
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
 from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
-from ident.calibration import Calibration
+from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
 _REMEDY = (
@@ -140,15 +141,120 @@ def robot_identity(cell: Cell) -> RobotIdentity:
     return RobotIdentity(_sha256(kinematics), _sha256(drives))
 
 
+def calibrated_robot(cell: Cell) -> CalibratedRobot:
+    """Return a cell's robot as its calibrations and its history name it."""
+    identity = robot_identity(cell)
+    described = read_urdf(cell.urdf).joints
+    joints = []
+    for joint in described:
+        parent = "" if joint.parent < 0 else described[joint.parent].name
+        joints.append(CalibratedJoint(joint.name, joint.kind.value, parent))
+    drives = []
+    for axis in cell.axes:
+        vendor_id = None if axis.identity is None else axis.identity.vendor_id
+        product_code = None if axis.identity is None else axis.identity.product_code
+        drives.append(CalibratedDrive(axis.name, axis.node_id, vendor_id, product_code))
+    motors = () if cell.chain is None else tuple(cell.chain.motors)
+    return CalibratedRobot(identity.kinematics_sha256, identity.drives_sha256, tuple(joints), tuple(drives), motors)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotDifference:
+    """A joint or a drive in which two robots differ, in words."""
+
+    found: str
+    expected: str
+
+
+def robot_differences(found: CalibratedRobot | None, expected: CalibratedRobot | None) -> tuple[RobotDifference, ...]:
+    """Name the joints and drives in which two robots differ; none for the same robot.
+
+    A number of a drive that one of the two leaves open differs from none. A calibration of an earlier version does not
+    say its robot (None), so that nothing differs.
+    """
+    if found is None or expected is None:
+        return ()
+    differences = []
+    if found.kinematics_sha256 != expected.kinematics_sha256:
+        for one, other in zip_longest(map(_joint_text, found.joints), map(_joint_text, expected.joints)):
+            if one != other:
+                differences.append(RobotDifference(one or "no further joint", other or "no further joint"))
+        if found.motors != expected.motors:
+            differences.append(RobotDifference(_motors_text(found.motors), _motors_text(expected.motors)))
+    by_axis = {drive.axis: drive for drive in expected.drives}
+    for drive in found.drives:
+        if drive.axis in by_axis:
+            differences += _differences_of_drives(drive, by_axis[drive.axis])
+    return tuple(differences)
+
+
+def _joint_text(joint: CalibratedJoint) -> str:
+    behind = f"behind {joint.parent}" if joint.parent else "on the base"
+    return f"joint {joint.name} ({joint.kind}, {behind})"
+
+
+def _motors_text(motors: Sequence[str]) -> str:
+    return f"motors on {', '.join(motors)}" if motors else "a motor on every joint"
+
+
+def _differences_of_drives(found: CalibratedDrive, expected: CalibratedDrive) -> list[RobotDifference]:
+    pairs = (
+        ("node id", "d", found.node_id, expected.node_id),
+        ("vendor id", "#x", found.vendor_id, expected.vendor_id),
+        ("product code", "#x", found.product_code, expected.product_code),
+    )
+    differences = []
+    for label, form, one, other in pairs:
+        if one is not None and other is not None and one != other:
+            words = f"drive of {found.axis} with {label} "
+            differences.append(RobotDifference(words + format(one, form), words + format(other, form)))
+    return differences
+
+
+def found_text(differences: Sequence[RobotDifference]) -> str:
+    """Join what was found of each difference; of many, the first ones and the number of the others."""
+    return _first_of([difference.found for difference in differences])
+
+
+def expected_text(differences: Sequence[RobotDifference]) -> str:
+    """Join what was expected of each difference, as `found_text`."""
+    return _first_of([difference.expected for difference in differences])
+
+
+_SHOWN = 3  #: Differences in a message
+
+
+def _first_of(texts: Sequence[str]) -> str:
+    more = len(texts) - _SHOWN
+    shown = "; ".join(texts[:_SHOWN])
+    return f"{shown}; and {more} more" if more > 0 else shown
+
+
+def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:
+    """Return in what the robot of a calibration is not that of a cell; None for the same one, or one that is not known.
+
+    The name of the cell is not compared.
+    """
+    if calibration.robot is None:
+        return None
+    differences = robot_differences(calibrated_robot(cell), calibration.robot)
+    if not differences:
+        return None
+    return Mismatch(
+        f"another robot with the cell name {cell.name!r}: {found_text(differences)}",
+        f"{expected_text(differences)}, as in the calibration",
+    )
+
+
 def _sha256(content: object) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:
-    """Return what shows that a calibration is of another cell; None for the same one."""
+    """Return what shows that a calibration is of another cell, or of another robot; None for the same one."""
     axes = tuple(gain.axis for gain in calibration.gains)
     if (cell.name, cell.axis_names) == (calibration.cell, axes):
-        return None
+        return mismatch_of_robot(calibration, cell)
     return Mismatch(
         f"cell {cell.name!r} with the axes {', '.join(cell.axis_names)}",
         f"cell {calibration.cell!r} with the axes {', '.join(axes)}, as in the calibration",

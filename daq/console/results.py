@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from daq.config.cell import Cell
+from daq.config.same_cell import mismatch_of_calibration
 from daq.documents.calibration_file import load_calibration
 from daq.documents.session_state import GuidedState, Outcome
-from daq.errors import DaqError, ExitCode
+from daq.errors import CalibrationRefused, DaqError, ExitCode
 from daq.jobs.guided import motion_left_s
 from daq.jobs.position import position_of, sessions_folder
 from daq.jobs.reporting import Conclusion, to_do
@@ -114,6 +115,14 @@ class Results:
         if known is None:
             return None
         path, calibration = known
+        mismatch = mismatch_of_calibration(calibration, self._cell)
+        if mismatch is not None:
+            raise CalibrationRefused(
+                str(path),
+                found=mismatch.found,
+                expected=mismatch.expected,
+                remedy="give the calibration of this cell",
+            )
         error = calibration.holdout_error_percent or calibration.relative_error_percent
         return {
             "file": path.name,

@@ -1,7 +1,7 @@
 """`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
 
 The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
-`Diagnosis`) are read as the classes of `ident`.
+`Diagnosis`, `CalibratedRobot`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnread
 from daq.files import replace_file
 from ident.calibration import (
     AcceptedEffect,
+    CalibratedRobot,
     Calibration,
     EncoderMisfit,
     Gain,
@@ -224,6 +225,7 @@ class CalibrationBody(StrictModel):
     payload_mass: tuple[PayloadMassEntry, ...] = ()
     encoder_misfit: EncoderMisfitEntry | None = None
     full_parameters: FullSetEntry | None = None
+    robot: CalibratedRobot | None = None
 
     @model_validator(mode="after")
     def _check_axes_of_payload_mass(self) -> Self:

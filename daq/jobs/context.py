@@ -422,6 +422,40 @@ def sessions_that_count(found: tuple[Session, ...], now: datetime, journal: Jour
     return counted
 
 
+def _require_own_history(context: SessionContext) -> None:
+    """Refuse a session whose calibration its history cannot take.
+
+    Raises:
+        JobHeld: the cell has another name now, or its history is of another robot with its name.
+        HistoryUnreadable, AuditUnusable: see `read_history`.
+    """
+    history = read_history(context.ledger)
+    name = context.cell.name
+    if history.renamed is not None:
+        raise JobHeld(
+            f"cell {name!r}",
+            found=f"a robot that was renamed to {history.renamed.new!r} at {history.renamed.at}",
+            expected="a cell file with its present name",
+            remedy="nothing has moved; write the new name into the cell file, and make the schedule again "
+            "(`drivegain schedule`)",
+        )
+    if history.other_robots:
+        raise JobHeld(
+            str(context.ledger.audit),
+            found=str(history.other_robots[0]),
+            expected="a history of one robot",
+            remedy="nothing has moved; give the cell file of that robot, or name another audit log for this one "
+            "(`history.audit` of the cell file)",
+        )
+    for other in history.possible_names:
+        text = (
+            f"found calibrations of cell {other!r} in the audit log, of a robot with the same joints and drives, and "
+            f"none of {name!r}; if this is that robot under a new name, `drivegain history {context.file} --rename "
+            f"{other}` takes its history and sessions over"
+        )
+        context.journal.say(Level.WARNING, "the cell may have been renamed", text=text)
+
+
 def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
     """Check disk space, history, interlock and drives.
 
@@ -430,7 +464,7 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
         take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
 
     Raises:
-        DiskSpaceShort, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
+        DiskSpaceShort, JobHeld, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder is gone.
     """
     settings = context.settings
@@ -444,7 +478,8 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
             expected=f"{settings.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
-    read_history(context.ledger)  # the gains are compared with it: unreadable now is better than after the recordings
+    # The gains are compared with it: what is wrong with it is better known now than after the recordings.
+    _require_own_history(context)
     release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
     tools.drives(context.cell, context.block_signals, take_over)

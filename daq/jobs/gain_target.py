@@ -12,7 +12,7 @@ from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import ConfigurationInconsistent
 from daq.files import sha256_of
-from daq.ledger.fold import drives_of
+from daq.ledger.names import drives_of
 from daq.writeback.drive_target import DriveTarget
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileTarget

@@ -36,6 +36,14 @@ class Form(Enum):
     JOURNAL = "journal"  #: systemd-journald, which takes the priority off
 
 
+_IN_CONCLUSION = frozenset({"found"})
+"""Events that the conclusion of a job, on standard output, has for a person. A terminal would show them twice."""
+
+
+_REPEATED_FIELDS = {"session ended": ("remark",)}
+"""Fields that the conclusion, or the error that ends the command, has for a person."""
+
+
 @dataclass(frozen=True, slots=True)
 class Journal:
     """Where events go."""
@@ -47,12 +55,14 @@ class Journal:
     step: str = ""  #: step of the lines that follow
 
     def say(self, level: Level, event: str, /, **fields: object) -> None:
-        """Write one event.
+        """Write one event; for a person, none that the conclusion repeats.
 
         Args:
             event: what happened, always in the same words.
             fields: plain JSON; what JSON has no word for is spelt as text.
         """
+        if self.form is Form.TEXT and event in _IN_CONCLUSION:
+            return
         line = self.line(level, event, **fields)
         # A reader that has gone is no reason to leave a robot half-way through its job.
         with suppress(OSError, ValueError):
@@ -63,8 +73,9 @@ class Journal:
         """Return the line of an event, with its end; the arguments are those of `say`."""
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
-            values = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in fields.items()}
-            details = ", ".join(f"{name} {value}" for name, value in values.items())
+            repeated = _REPEATED_FIELDS.get(event, ())
+            words = [in_words(name, value) for name, value in fields.items() if name not in repeated]
+            details = ", ".join(filter(None, words))
             details = "".join(letter if letter.isprintable() else " " for letter in details)
             line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
         else:
@@ -74,6 +85,43 @@ class Journal:
             if self.form is Form.JOURNAL:
                 line = f"<{int(level)}>{line}"
         return line + "\n"
+
+
+def in_words(name: str, value: object) -> str:
+    """Return a field of an event as a person reads it; empty for one that is for programs alone."""
+    if name in _FOR_PROGRAMS:
+        return ""
+    words = _value_in_words(value)
+    if name in _SENTENCES:
+        return words
+    if isinstance(value, list | tuple) and name in _OF_EACH_AXIS:
+        return f"{_OF_EACH_AXIS[name]}: {words}"
+    for suffix, unit in _UNITS.items():
+        if name.endswith(suffix):
+            return f"{_label(name.removesuffix(suffix))} {words} {unit}"
+    return f"{_label(name)} {words}"
+
+
+_SENTENCES = frozenset({"text", "remark", "reason", "words"})  #: Fields that are sentences, and need no name
+_FOR_PROGRAMS = frozenset({"in_short", "differs", "error", "exit_code"})
+_OF_EACH_AXIS = {"missing": "missing samples of each axis"}
+_UNITS = {"_s": "s", "_mb": "MB", "_kg": "kg", "_percent": "%"}
+
+
+def _label(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _value_in_words(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_value_in_words, value)) if any(value) else "none"
+    return str(value)
 
 
 def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -70,6 +70,34 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
         read = ((entry, _read(entry / STATE)) for entry in folders)
         found = [Session(entry, state) for entry, state in read if state is not None and cell in (None, state.cell)]
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
+
+
+def rename_sessions(folders: Iterable[Path], old: str, new: str, until: datetime) -> int:
+    """Give the sessions of a cell its new name; return their number.
+
+    Each state is replaced whole, so a process that is killed in between leaves the rest to the next call.
+
+    Args:
+        folders: of sessions; one that does not exist has none.
+        old: name of the cell before.
+        new: its name now.
+        until: when it was renamed; a session that began later is of another cell with the old name.
+
+    Raises:
+        ConfigurationInconsistent: a folder is none, or cannot be read.
+        OutputFailed: the file system refuses.
+    """
+    count = 0
+    for folder in folders:
+        for session in sessions_to_rename(folder, old, until):
+            session.update(cell=new)
+            count += 1
+    return count
+
+
+def sessions_to_rename(folder: Path, old: str, until: datetime) -> tuple[Session, ...]:
+    """Return the sessions of a cell that `rename_sessions` gives another name. Args and errors as there."""
+    return tuple(session for session in sessions(folder, old) if session.began <= until)
 
 
 def begun_until(found: tuple[Session, ...], now: datetime) -> tuple[Session, ...]:

@@ -57,6 +57,8 @@ class AuditAction(Enum):
     ACKNOWLEDGED = "acknowledged"
     CALIBRATION_ENTERED = "calibration entered"
     """The history has this calibration; details: SHA-256 of its file, cell, time, document, and its figures."""
+    RENAMED = "renamed"
+    """A cell has another name; details: `old_name`, `cell`, robot. It counts for the entries before it."""
     WRITE_FOUND = "write found"
     """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
     TORN_LINE = "torn line"

@@ -9,13 +9,23 @@ from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from daq.config.cell import Cell
+from daq.config.same_cell import (
+    RobotDifference,
+    calibrated_robot,
+    expected_text,
+    found_text,
+    robot_differences,
+)
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
 from daq.ledger.dates import corrected, times_by_order
-from ident.calibration import Calibration, Gain, Source
+from daq.ledger.names import RenamedCell, drives_of, names_in, renamed_to, with_present_names
+from ident.calibration import CalibratedRobot, Calibration, Gain, Source
 
 
 class WriteAction(Enum):
@@ -61,6 +71,7 @@ class Entry:
     #: `created` by the clock of that day, where the order of the audit log shows that it was wrong; else None. Then
     #: `created` and `recorded` are what that order allows.
     created_by_clock: datetime | None = None
+    robot: CalibratedRobot | None = None  #: that it is of; None where it was entered by an earlier version
 
     def gain_of(self, axis: str) -> Gain | None:
         """Return the gain of an axis, None for an axis that it does not have."""
@@ -70,6 +81,21 @@ class Entry:
     def applied(self) -> bool:
         """Whether a controller ever had its gains."""
         return bool(self.events)
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignEntry:
+    """A calibration under a cell's name that is of another robot, and is compared with nothing."""
+
+    entry: Entry  #: itself
+    differences: tuple[RobotDifference, ...]  #: found of its robot, expected of the cell's
+
+    def __str__(self) -> str:
+        return (
+            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is of another robot with the "
+            f"cell name {self.entry.cell!r}: found {found_text(self.differences)}; expected "
+            f"{expected_text(self.differences)}, as in the cell file"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +121,6 @@ class RecordedAcceptance:
     log_sha256: str | None  #: of the log of these moves; None where the audit log does not say
     remark: str  #: what was found, in words; may be empty
     undo: str  #: command that undoes the write; empty where they were accepted
-
-
-def drives_of(cell: str) -> str:
-    """Return the name of a cell's drives in audit and history."""
-    return f"drives of cell {cell}"
 
 
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
@@ -214,6 +235,11 @@ class History:
     acceptances: tuple[RecordedAcceptance, ...] = ()  #: runs of new moves after a write, oldest first
     unreadable: tuple[str, ...] = ()  #: calibrations of the audit log that cannot be read, as sentences
     may_lack: bool = False  #: whether the audit log is not what was written, so that something may be missing here
+    #: Calibrations of another robot with the cell's name, oldest first. No change of a gain is computed with them.
+    other_robots: tuple[ForeignEntry, ...] = ()
+    renamed: RenamedCell | None = None  #: the rename by which this same robot has another name now
+    #: Names in the same audit log whose calibrations are all of a robot like this one, where the cell has none.
+    possible_names: tuple[str, ...] = ()
 
     def in_force(self, target: str | None = None) -> str | None:
         """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""
@@ -261,6 +287,7 @@ class EnteredCalibration:
     entered: datetime  #: when it was entered, UTC
     document: str | None  #: the whole calibration; None where an earlier entry has it
     figures: dict[str, Any] | None  #: as of `figures_of`; None in an entry of an earlier version
+    robot: object = None  #: as of `ident.calibration.CalibratedRobot`; None in an entry of an earlier version
 
 
 def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
@@ -269,6 +296,8 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     A write without an end counts where a later entry shows that it was made: the next write found its content, or a
     process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
     """
+    as_written = entries
+    entries = with_present_names(as_written)
     events = _events(writes_to(cell, entries, witnessed_writes(entries), everywhere=True))
     by_digest: dict[str | None, list[Event]] = {}
     for event in events:
@@ -284,6 +313,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         try:
             figures = one.figures or figures_of_document(one)
             entry = entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ()))
+            entry = replace(entry, robot=_robot_of(one.robot))
             if time is None:
                 recorded.setdefault(entry.logs, entry.recorded)
             entry = _dated(entry, one.at, time, recorded)
@@ -292,15 +322,66 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
             unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
         except (KeyError, TypeError, ValueError) as error:
             unreadable.append(f"{_named(one)}: its figures are not those that drivegain writes: {error}")
-    last = _units(found[-1]) if found else {}
-    comparable = [one for one in found if _units(one) == last]
+    robot = calibrated_robot(cell)
+    own = []
+    foreign = []
+    for entry in found:
+        differences = robot_differences(entry.robot, robot)
+        if differences:
+            foreign.append(ForeignEntry(entry, differences))
+        else:
+            own.append(entry)
+    last = _units(own[-1]) if own else {}
+    comparable = [one for one in own if _units(one) == last]
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
         acknowledgements=tuple(acknowledgements_of(entries, cell.name)),
         acceptances=acceptances,
         unreadable=tuple(unreadable),
+        other_robots=tuple(foreign),
+        renamed=_rename_of_robot(as_written, cell.name, robot),
+        possible_names=() if calibrations else _names_of_robot(entries, robot),
     )
+
+
+_ROBOT: TypeAdapter[CalibratedRobot | None] = TypeAdapter(CalibratedRobot | None)
+
+
+def _robot_of(tree: object) -> CalibratedRobot | None:
+    """Return the robot of an entry; None where it has none.
+
+    Raises:
+        ValueError: it is not as drivegain writes it.
+    """
+    return _ROBOT.validate_python(tree)
+
+
+def _rename_of_robot(entries: Iterable[AuditEntry], name: str, robot: CalibratedRobot) -> RenamedCell | None:
+    """Return the rename of a robot that is described under its old name; None for another robot of that name."""
+    rename = renamed_to(entries, name)
+    if rename is None:
+        return None
+    try:
+        renamed = _robot_of(rename.robot)
+    except ValueError:
+        return rename
+    return None if robot_differences(renamed, robot) else rename
+
+
+def _names_of_robot(entries: Sequence[AuditEntry], robot: CalibratedRobot) -> tuple[str, ...]:
+    """Return the names in an audit log under which every calibration is of a robot that looks the same."""
+    names = []
+    for name in names_in(entries):
+        robots = []
+        for one in entered_calibrations(entries, name):
+            try:
+                robots.append(_robot_of(one.robot))
+            except ValueError:
+                continue
+        if robots and all(other is not None and not robot_differences(other, robot) for other in robots):
+            names.append(name)
+    return tuple(names)
 
 
 def _dated(entry: Entry, at: datetime, by_order: datetime | None, known: Mapping[str, datetime]) -> Entry:
@@ -357,14 +438,16 @@ def _events(writes: Iterable[AuditedWrite]) -> list[Event]:
 def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[EnteredCalibration]:
     """Return the calibrations of a cell that an audit log has, once each, in the order in which they were entered."""
     found: dict[str, EnteredCalibration] = {}
-    for entry in entries:
+    for entry in with_present_names(tuple(entries)):
         one = _entered_calibration(entry, cell)
         if one is None:
             continue
         first = found.setdefault(one.digest, one)
         # A later entry gives the figures of one that an earlier version has entered.
         document = first.document or one.document
-        found[one.digest] = replace(first, document=document, figures=first.figures or one.figures)
+        found[one.digest] = replace(
+            first, document=document, figures=first.figures or one.figures, robot=first.robot or one.robot
+        )
     return list(found.values())
 
 
@@ -378,12 +461,13 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     known = figures if isinstance(figures, dict) else None
     if digest is None or entered == _NEVER or (document is None and known is None):
         return None
-    return EnteredCalibration(entry.number, digest, at_of(entry) or entered, entered, document, known)
+    at = at_of(entry) or entered
+    return EnteredCalibration(entry.number, digest, at, entered, document, known, entry.details.get("robot"))
 
 
 def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
     """Yield the changes that were explained in a cell, oldest first."""
-    for entry in entries:
+    for entry in with_present_names(tuple(entries)):
         found = _acknowledgement_of(entry)
         if found is not None and text_field(entry, "cell") == cell:
             yield found
@@ -404,7 +488,7 @@ def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
 
 def acceptances_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[RecordedAcceptance]:
     """Yield the results of new moves with written gains in a cell, oldest first."""
-    for entry in entries:
+    for entry in with_present_names(tuple(entries)):
         found = _acceptance_of(entry)
         if found is not None and text_field(entry, "cell") == cell:
             yield found
@@ -450,6 +534,7 @@ def writes_to(
         made: writes without an end that were made all the same; `write found` reports some of them.
         everywhere: include files that are not the cell's controller (`apply --to`).
     """
+    entries = with_present_names(entries)
     targets = _targets(cell)
     begun = {one.number: one for one in entries if one.action in _BEGINS}
     unended = {one.begun.number for one in made} - {begun_by(one) for one in entries if is_end(one)}

@@ -10,12 +10,13 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
 
 from daq.config.cell import Cell
+from daq.config.same_cell import calibrated_robot, mismatch_of_robot
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, reason_of, writing
 from daq.files import fsync_folder
@@ -33,7 +34,6 @@ from daq.ledger.audit import (
 )
 from daq.ledger.fold import (
     AuditedWrite,
-    Entry,
     Event,
     History,
     RecordedAcceptance,
@@ -54,6 +54,7 @@ from daq.ledger.migration import (
     read_stored,
     set_aside,
 )
+from daq.ledger.names import cell_names, former_names, rename_of, with_present_names
 from ident.calibration import Calibration
 
 _LOG = logging.getLogger("drivegain")
@@ -154,6 +155,18 @@ def read_history(ledger: Ledger) -> History:
     return replace(history, may_lack=not verdict.holds)
 
 
+def names_of(cell: Cell) -> frozenset[str]:
+    """Return the name of a cell, and those that it had before its audit log says that it was renamed.
+
+    Raises:
+        AuditUnusable: the audit log is no regular file, or it cannot be read.
+    """
+    ledger = Ledger.of(cell)
+    if ledger is None:
+        return frozenset({cell.name})
+    return former_names(verify(ledger.audit).intact, cell.name) | {cell.name}
+
+
 def is_damaged(audit: Path) -> bool:
     """Whether an audit log is not what was written.
 
@@ -181,7 +194,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
-    known = {one.digest for one in history.entries}
+    known = {one.digest for one in history.entries} | {one.entry.digest for one in history.other_robots}
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
     is_noted = bool(noted) or not verdict.entries
     return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
@@ -241,7 +254,7 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
     known = {one.digest for one in entered_calibrations(entries, ledger.cell.name)}
     new = digest not in known
     if new:
-        _check_like(ledger, calibration, fold(entries, ledger.cell).entries)
+        _check_like(ledger, calibration, fold(entries, ledger.cell))
         details = {
             "sha256": digest,
             "cell": ledger.cell.name,
@@ -249,6 +262,8 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
             "document": encode_calibration(calibration).decode(),
             "figures": figures_of(calibration, digest, at),
         }
+        if calibration.robot is not None:
+            details["robot"] = asdict(calibration.robot)
         _append(
             ledger, EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details)
         )
@@ -272,6 +287,111 @@ def acknowledge(ledger: Ledger, axis: str, *, since: datetime, at: datetime, who
     """
     details = {"axis": axis, "cell": ledger.cell.name, "since": since.isoformat(), "why": why}
     _append(ledger, EntryDraft(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details))
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRename:
+    """What a rename takes over in a ledger."""
+
+    old: str  #: name of the cell
+    new: str  #: that of its cell file
+    calibrations: int  #: under the old name
+    writes: int  #: of their gains, and rollbacks
+    acknowledgements: int  #: explained changes
+    undescribed: int  #: calibrations of earlier versions, which do not say their robot
+    entered_at: datetime | None  #: when the audit log got the rename; None where it has none yet
+
+
+def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
+    """Check that the history of an old name is of this cell's robot; nothing is written.
+
+    Args:
+        ledger: of the cell, whose file has the new name.
+        old: the name before.
+
+    Raises:
+        DataError: the audit log is not what was written, has nothing under the old name, or has calibrations of
+            another robot under one of the two names.
+        AuditUnusable: the audit log is no regular file, or it cannot be read.
+    """
+    new = ledger.cell.name
+    verdict = verify(ledger.audit, noted_heads(ledger.audit))
+    if not verdict.holds:
+        raise audit_error(ledger.audit, verdict)
+    entries = verdict.entries
+    under_old = fold(entries, replace(ledger.cell, name=old))
+    for history in (under_old, fold(entries, ledger.cell)):
+        _require_own_robot(ledger, history)
+    is_known = old in cell_names(with_present_names(entries))
+    is_entered = not is_known and old in former_names(entries, new)
+    if not is_known and not is_entered:
+        known = ", ".join(map(repr, sorted(cell_names(entries)))) or "none"
+        raise DataError(
+            str(ledger.audit),
+            found=f"nothing of a cell {old!r}; cells in it: {known}",
+            expected=f"the history of the cell that is called {new!r} now",
+            remedy="give its earlier name as the audit log has it, or correct `history.audit` of the cell file",
+        )
+    return PlannedRename(
+        old=old,
+        new=new,
+        calibrations=len(under_old.entries),
+        writes=len(under_old.events),
+        acknowledgements=len(under_old.acknowledgements),
+        undescribed=sum(entry.robot is None for entry in under_old.entries),
+        entered_at=_entered_rename_at(entries, old, new) if is_entered else None,
+    )
+
+
+def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetime) -> None:
+    """Enter that a cell has another name: one entry, which counts for all that was entered before it.
+
+    Raises:
+        AuditUnusable, OutputFailed: it could not be recorded.
+    """
+    if planned.entered_at is not None:
+        return
+    details = {
+        "cell": planned.new,
+        "old_name": planned.old,
+        "robot": asdict(calibrated_robot(ledger.cell)),
+    }
+    _append(ledger, EntryDraft(AuditAction.RENAMED, at, who, f"cell {planned.new}", details))
+
+
+def _entered_rename_at(entries: Sequence[AuditEntry], old: str, new: str) -> datetime | None:
+    """Return when a cell got its present name, by the entry of its first or its last rename."""
+    found = None
+    for one in entries:
+        rename = rename_of(one)
+        if rename is not None and (rename.old == old or rename.new == new):
+            found = at_of(one) or found
+    return found
+
+
+def _require_own_robot(ledger: Ledger, history: History) -> None:
+    """Refuse to join the history of another robot.
+
+    Raises:
+        DataError: it is one.
+    """
+    axes = ledger.cell.axis_names
+    found = ""
+    expected = "calibrations of the robot that the cell file describes"
+    if history.other_robots:
+        found = str(history.other_robots[0])
+    elif history.entries and tuple(gain.axis for gain in history.entries[-1].gains) != axes:
+        entry = history.entries[-1]
+        named = ", ".join(gain.axis for gain in entry.gains)
+        found = f"calibrations of cell {entry.cell!r} with the axes {named}"
+        expected = f"the axes {', '.join(axes)}, as in the cell file"
+    if found:
+        raise DataError(
+            str(ledger.audit),
+            found=found,
+            expected=expected,
+            remedy="two robots have no common history: give the earlier name of this robot; nothing was entered",
+        )
 
 
 def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
@@ -428,16 +548,32 @@ def _end_found_writes(ledger: Ledger) -> None:
         _append(ledger, EntryDraft(AuditAction.WRITE_FOUND, at, begun.who, begun.subject, details))
 
 
-def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[Entry]) -> None:
+def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> None:
     """Refuse a calibration that cannot be compared with those of the history."""
+    remedy = (
+        "gains are compared over time only where they mean the same: begin another audit log "
+        "(`history.audit` of the cell file); nothing was entered"
+    )
     units = {gain.axis: gain.unit for gain in calibration.gains}
     known: dict[str, str] = {}
-    for one in entries:
+    for one in history.entries:
         known |= {gain.axis: gain.unit for gain in one.gains}
+    robot = mismatch_of_robot(calibration, ledger.cell)
     other = [axis for axis in units if axis in known and units[axis] != known[axis]]
     if calibration.cell != ledger.cell.name:
         found = f"a calibration of cell {calibration.cell!r}"
         expected = f"of {ledger.cell.name!r}, as all in this history"
+    elif robot is not None:
+        found = robot.found
+        expected = robot.expected
+        remedy = "give the cell file of the robot that was calibrated; nothing was entered"
+    elif history.renamed is not None:
+        found = f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
+        expected = f"{history.renamed.new!r}, its name since"
+        remedy = "give the cell file with the new name; nothing was entered"
+    elif history.other_robots:
+        found = str(history.other_robots[0])
+        expected = "calibrations of one robot in a history"
     elif known and units.keys() != known.keys():
         found = f"gains of {', '.join(units)}"
         expected = f"of {', '.join(known)}"
@@ -451,8 +587,7 @@ def _check_like(ledger: Ledger, calibration: Calibration, entries: Collection[En
         str(ledger.audit),
         found=found,
         expected=expected,
-        remedy="gains are compared over time only where they mean the same: begin another audit log "
-        "(`history.audit` of the cell file); nothing was entered",
+        remedy=remedy,
     )
 
 
@@ -536,7 +671,8 @@ def _last_write(history: History, digest: str, place: str | None) -> Event | Non
     in_force = [event for event in newest.values() if event.digest == digest]
     here = [event for event in in_force if event.target == place]
     writes = here or in_force or [event for event in history.events if event.digest == digest]
-    return max(writes, key=lambda event: event.at, default=None)
+    # In the order of the log: their times are by a clock that may have been wrong.
+    return max(writes, key=history.events.index, default=None)
 
 
 def _next_at_its_place(history: History, write: Event) -> Event | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Literal
 
+from daq.config.same_cell import expected_text, found_text, robot_differences
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused
 from daq.files import sha256
@@ -398,6 +399,14 @@ def _require_same(calibration: Calibration, earlier: Calibration) -> None:
             found=f"cell {earlier.cell!r} with axes {', '.join(sorted(others))}",
             expected=f"cell {calibration.cell!r} with axes {', '.join(sorted(axes))}",
             remedy="give an earlier calibration of the same cell",
+        )
+    differences = robot_differences(earlier.robot, calibration.robot)
+    if differences:
+        raise CalibrationRefused(
+            "--beside",
+            found=f"another robot with the cell name {earlier.cell!r}: {found_text(differences)}",
+            expected=f"{expected_text(differences)}, as in the calibration of this page",
+            remedy="give an earlier calibration of the same robot",
         )
 
 

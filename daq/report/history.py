@@ -19,8 +19,9 @@ from daq.errors import ControllerUnfit, counted
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
 from daq.ledger.audit import BACKUPS_WITHOUT_LOG, head_file
-from daq.ledger.fold import Entry, Event, History, WriteAction, drives_of
+from daq.ledger.fold import Entry, Event, History, WriteAction
 from daq.ledger.ledger import Verification
+from daq.ledger.names import drives_of
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
@@ -164,6 +165,8 @@ class HistoryReport(Report):
     axes: list[HistoryAxis]
     audit: AuditReport | None = None
     """with --verify"""
+    other_robots: list[str] | None = None
+    """calibrations of another robot with the cell's name, each with what differs; left out where there are none"""
 
 
 def show_history(
@@ -300,7 +303,7 @@ def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
 
 def history_report(
     cell: str,
-    entries: Sequence[Entry],
+    history: History,
     chosen: Sequence[Series],
     all_series: Sequence[Series],
     in_force: str | None,
@@ -310,16 +313,18 @@ def history_report(
 
     Args:
         cell: its name.
-        entries: its calibrations.
+        history: of the cell.
         chosen: axes that were asked for.
         all_series: all axes.
         in_force: digest of the calibration whose gains are the current gains.
         checked: state of audit log and history; None where it was not asked for.
     """
-    others = {} if checked is None else {"audit": audit_report(checked)}
+    others: dict[str, Any] = {} if checked is None else {"audit": audit_report(checked)}
+    if history.other_robots:
+        others["other_robots"] = [str(one) for one in history.other_robots]
     return HistoryReport.of(
         cell=cell,
-        calibrations=len(entries),
+        calibrations=len(history.entries),
         in_force=in_force,
         chart=asdict(CHART),
         pattern=pattern_of(all_series),

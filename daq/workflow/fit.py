@@ -14,6 +14,7 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.config.effects import place_effect
 from daq.config.policy import DEFAULT_APPLY_POLICY
+from daq.config.same_cell import calibrated_robot
 from daq.config.yaml_file import Fault
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
@@ -693,6 +694,7 @@ def _calibration(fitted: Fit) -> Calibration:
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,
         encoder_misfit=encoder_misfit_of(fitted.geometry, cell, applied=fitted.is_corrected),
+        robot=calibrated_robot(cell),
     )
 
 

@@ -23,7 +23,8 @@ from daq.config.controller import GainObject
 from daq.config.yaml_file import DocumentKind, StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.fold import drives_of
+from daq.ledger.ledger import names_of
+from daq.ledger.names import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
 from daq.writeback.target import Written
@@ -329,7 +330,7 @@ class DriveTarget:
     def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, DriveParameter]]:
         axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
         unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
-        if record.cell != self.cell.name or unknown_axes:
+        if record.cell not in names_of(self.cell) or unknown_axes:
             raise ControllerUnfit(
                 str(path),
                 found=f"a write to cell {record.cell!r}"

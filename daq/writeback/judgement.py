@@ -72,6 +72,14 @@ def query_history(
         return NOTHING
     if history.may_lack:
         _LOG.warning(MAY_LACK)
+    if history.renamed is not None:
+        _LOG.warning(
+            "cell %r was renamed to %r at %s: its history is under that name, so the current gains are taken as exact; "
+            "give the cell file with the new name",
+            cell.name,
+            history.renamed.new,
+            history.renamed.at,
+        )
     return known_of(history, target, sha256(request.signed), changes)
 
 

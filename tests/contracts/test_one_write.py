@@ -23,6 +23,7 @@ WRITERS = {
     "record_session": ("daq.ledger.ledger", {"daq/jobs/decision.py", "daq/jobs/reporting.py"}),
     "acknowledge": ("daq.ledger.ledger", {"daq/cli/history.py"}),
     "migrate": ("daq.ledger.ledger", {"daq/cli/history.py"}),
+    "rename_cell": ("daq.ledger.ledger", {"daq/cli/history.py"}),
 }
 """Each function that writes to the ledger, by name: its module, and the files that may import it."""
 DOORS = ("apply", "rollback")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from daq.config.same_cell import calibrated_robot, expected_text, found_text, robot_differences
 from daq.workflow.geometry_diagnoses import LOOK_FOR, UNEXPLAINED, misfit_text
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import GateFinding
@@ -31,10 +32,21 @@ OF_DESCRIPTION = frozenset(CORRECTED_BY) | NEVER_CORRECTED | BY_ENCODERS
 
 
 def cell(context: GateContext) -> Iterator[GateFinding]:
-    """Refuse a calibration of another cell."""
+    """Refuse a calibration of another cell, or of another robot with the same name."""
     found = context.calibration.cell
-    if context.cell is not None and found != context.cell.name:
+    if context.cell is None:
+        return
+    if found != context.cell.name:
         yield "calibration", f"cell {found!r}", f"cell {context.cell.name!r}", "give its own --cell"
+        return
+    differences = robot_differences(context.calibration.robot, calibrated_robot(context.cell))
+    if differences:
+        yield (
+            "calibration",
+            f"one of another robot with the cell name {found!r}: {found_text(differences)}",
+            f"{expected_text(differences)}, as in the cell file",
+            "give the cell file of the robot that was calibrated; of a cell that was changed since, record again",
+        )
 
 
 def configuration(context: GateContext) -> Iterator[GateFinding]:

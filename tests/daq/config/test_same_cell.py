@@ -12,7 +12,15 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.config.same_cell import correction_of, differing_sections, differing_zeros, mismatch
+from daq.config.same_cell import (
+    calibrated_robot,
+    correction_of,
+    differing_sections,
+    differing_zeros,
+    mismatch,
+    mismatch_of_calibration,
+    robot_identity,
+)
 from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
 from daq.errors import ExitCode, LogsDiffer
 from daq.log.conversion import load_run
@@ -247,6 +255,95 @@ def test_every_verb_refuses_the_description_of_another_robot(
     said = " ".join(capsys.readouterr().err.split())
     assert "'demo'" in said
     assert "'press'" in said
+
+
+SAME_NAME: dict[str, tuple[Callable[[str], str], str]] = {
+    "drive": (
+        lambda text: text.replace("product_code: 0x00040200", "product_code: 0x00040300"),
+        "drive of J1 with product code 0x40200",
+    ),
+    "node": (_replaced("node_id: 3", "node_id: 33"), "drive of J3 with node id 3"),
+}
+OF_ANOTHER_ROBOT: dict[str, tuple[list[str], ExitCode]] = {
+    "validate": (["validate", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
+    "export csv": (["export", "csv", "CALIBRATION", "LOG", "--out", "out.csv"], ExitCode.DATA_UNFIT),
+    "console": (["console", "CELL", "--calibration", "CALIBRATION"], ExitCode.DATA_UNFIT),
+    "weigh": (["weigh", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
+    "contact": (["contact", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
+    "certificate": (["certificate", "CALIBRATION", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
+    "beside": (["certificate", "OWN", "--beside", "CALIBRATION", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
+    "export urdf": (["export", "urdf", "CELL", "CALIBRATION", "--out", "out.urdf"], ExitCode.CONFIGURATION),
+    "export mjcf": (["export", "mjcf", "CELL", "CALIBRATION", "--out", "out.xml"], ExitCode.CONFIGURATION),
+    "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
+    "monitor": (["monitor", "CELL", "--calibration", "CALIBRATION", "--once"], ExitCode.DATA_UNFIT),
+    "apply": (["apply", "CELL", "CALIBRATION", "--configuration-changed"], ExitCode.CALIBRATION_REFUSED),
+    "history": (["history", "CELL", "--add", "CALIBRATION"], ExitCode.DATA_UNFIT),
+}
+
+
+@pytest.mark.parametrize("different", SAME_NAME)
+@pytest.mark.parametrize("verb", OF_ANOTHER_ROBOT)
+def test_every_verb_refuses_a_calibration_of_another_robot_with_the_same_name(
+    verb: str,
+    different: str,
+    checkout: Path,
+    tmp_path: Path,
+    log: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    change, said = SAME_NAME[different]
+    own = _copy(checkout, tmp_path, lambda text: text)
+    other = load_cell(_copy(checkout, tmp_path, change, "other.yaml"))
+    of_other = tmp_path / "other-calibration.yaml"
+    save_calibration(replace(_calibration("demo"), robot=calibrated_robot(other)), of_other)
+    of_own = tmp_path / "own-calibration.yaml"
+    save_calibration(replace(_calibration("demo"), robot=calibrated_robot(load_cell(own))), of_own)
+    files = {"LOG": str(log), "CELL": str(own), "CALIBRATION": str(of_other), "OWN": str(of_own)}
+    arguments, code = OF_ANOTHER_ROBOT[verb]
+    assert main([files.get(word, word) for word in arguments]) == code
+    captured = capsys.readouterr()
+    text = " ".join((captured.out + captured.err).split())
+    assert "another robot with the cell name 'demo'" in text
+    # On the page of `beside`, the calibration is the own one.
+    assert said.rsplit(" ", 1)[0] in text
+
+
+def test_a_calibration_names_the_joint_in_which_its_robot_differs(checkout: Path) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    calibration = replace(_calibration("demo"), robot=calibrated_robot(demo))
+    assert mismatch_of_calibration(calibration, demo) is None
+    sliding = replace(demo, urdf=demo.urdf.replace('type="revolute"', 'type="prismatic"', 1))
+    found = mismatch_of_calibration(calibration, sliding)
+    assert found is not None
+    assert found.found == "another robot with the cell name 'demo': joint J1 (prismatic, on the base)"
+    assert found.expected == "joint J1 (revolute, on the base), as in the calibration"
+
+
+def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(checkout: Path) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    calibration = replace(_calibration("demo"), robot=calibrated_robot(demo))
+    first = demo.axes[0]
+    assert first.identity is not None
+    exchanged = replace(first, identity=replace(first.identity, serial=99))
+    unnamed = replace(first, identity=None)
+    for axis in (exchanged, unnamed, replace(first, zero_offset_rad=0.1)):
+        assert mismatch_of_calibration(calibration, replace(demo, axes=(axis, *demo.axes[1:]))) is None
+    lengthened = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"))
+    assert mismatch_of_calibration(calibration, lengthened) is None
+    # Files of earlier versions do not name their robot.
+    assert mismatch_of_calibration(_calibration("demo"), replace(demo, axes=(unnamed, *demo.axes[1:]))) is None
+
+
+def test_a_calibration_has_the_digests_of_a_plan_of_its_robot(checkout: Path) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    robot = calibrated_robot(demo)
+    identity = robot_identity(demo)
+    assert (robot.kinematics_sha256, robot.drives_sha256) == (identity.kinematics_sha256, identity.drives_sha256)
+    content = encode_calibration(replace(_calibration("demo"), robot=robot))
+    assert decode_calibration(content, "calibration.yaml").robot == robot
+    assert f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}".encode() in content
 
 
 def test_the_axes_whose_zeros_differ_are_found_among_the_sections(checkout: Path, demo: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,9 +19,11 @@ from daq.advice import for_command_line
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.config.same_cell import calibrated_robot
 from daq.console.live import Live
 from daq.console.results import Results
 from daq.console.server import CONNECTIONS, LARGEST_READERS, Page
+from daq.documents.calibration_file import save_calibration
 from daq.errors import ExitCode
 from daq.ledger.ledger import MAY_LACK
 from daq.log.feed import Feed
@@ -219,6 +222,20 @@ def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: P
     shown = results.document()["history"]
     assert shown["problem"] == MAY_LACK
     assert shown["calibrations"] == 1
+
+
+def test_the_gains_of_another_robot_are_a_problem_on_the_page(cell: Cell, cell_file: Path, tmp_path: Path) -> None:
+    own = calibrated_robot(cell)
+    other = replace(own, drives=(replace(own.drives[0], node_id=99), *own.drives[1:]))
+    calibration = tmp_path / "calibration.yaml"
+    results = Results(cell_file, cell, calibration)
+    save_calibration(replace(demo_calibration(), robot=own), calibration)
+    assert results.document()["gains"] is not None
+    calibration.unlink()
+    save_calibration(replace(demo_calibration(), robot=other), calibration)
+    document = results.document()
+    assert document["gains"] is None
+    assert any("drive of J1 with node id 1" in problem for problem in document["problems"])
 
 
 def test_a_file_that_no_reader_expected_does_not_end_the_looking(cell: Cell, cell_file: Path) -> None:

@@ -9,7 +9,7 @@ import signal
 import socket
 import tracemalloc
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pytest
 
 from daq.cli.terminal import interruptible
 from daq.config.recalibration import Command, Interlock
+from daq.config.same_cell import calibrated_robot
 from daq.documents.session_state import Outcome
 from daq.errors import (
     BusTaken,
@@ -34,12 +35,15 @@ from daq.errors import (
 from daq.jobs.context import section_of
 from daq.jobs.job import preview, time_bound
 from daq.jobs.journal import Form, Journal
-from daq.ledger.audit import AuditAction
+from daq.ledger.audit import AuditAction, append
+from daq.ledger.fold import figures_of
+from daq.ledger.ledger import Ledger
 from daq.workflow.bus_lock import bus_lock, lock_name
 from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from drivers.simulation.drive import PowerState
+from tests.daq.histories import calibration_of, digest_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, Rig, make_rig, powerless, serving
 
@@ -70,6 +74,34 @@ def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made
     rig.closed.touch()
     assert rig.job().outcome is Outcome.APPLIED
     assert rig.session.state.attempt == 2
+
+
+def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(tmp_path: Path, made: Made) -> None:
+    """Nothing has moved, and the message says the name, or the drive."""
+    rig = made_rig(tmp_path / "cell", made)
+    asked = []
+    rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
+    robot = calibrated_robot(rig.cell)
+    ledger = Ledger.of(rig.cell)
+    assert ledger is not None
+    drives = (replace(robot.drives[0], product_code=1), *robot.drives[1:])
+    other = replace(calibration_of(0), robot=replace(robot, drives=drives))
+    details = {
+        "sha256": digest_of(other),
+        "cell": "demo",
+        "entered": BEGAN.isoformat(),
+        "figures": figures_of(other, digest_of(other), BEGAN),
+        "robot": asdict(other.robot) if other.robot is not None else None,
+    }
+    entered = AuditAction.CALIBRATION_ENTERED
+    append(ledger.audit, entered, at=BEGAN, who="anna", subject="history of demo", details=details)
+    error = held(rig, JobHeld, ExitCode.JOB_HELD)
+    assert "another robot with the cell name 'demo': found drive of J1 with product code 0x1;" in str(error)
+    renamed = {"old_name": "demo", "cell": "press", "robot": asdict(robot)}
+    append(ledger.audit, AuditAction.RENAMED, at=BEGAN, who="anna", subject="cell press", details=renamed)
+    error = held(rig, JobHeld, ExitCode.JOB_HELD)
+    assert "a robot that was renamed to 'press'" in str(error)
+    assert asked == []
 
 
 def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: Path, one_move: Path) -> None:

@@ -65,6 +65,28 @@ def test_a_person_reads_words_and_no_control_characters() -> None:
     assert "share 0.25" in line
 
 
+def test_a_person_reads_no_keys_and_no_lists_of_python() -> None:
+    recorded = said(Form.TEXT, samples=5000, lost_cycles=0, missing=(0, 0, 0))
+    assert recorded.endswith("samples 5000, lost cycles 0, missing samples of each axis: none\n")
+    missing = said(Form.TEXT, missing=(0, 2, 0))
+    assert missing.endswith("missing samples of each axis: 0, 2, 0\n")
+    assert said(Form.TEXT, text="J3 is stiff", in_short=True).endswith(": J3 is stiff\n")
+    assert said(Form.TEXT, remark="written", exit_code=0, outcome="applied").endswith(": written, outcome applied\n")
+    assert said(Form.TEXT, free_mb=500, seconds=30.0, payload=None).endswith(
+        ": free 500 MB, seconds 30, payload none\n"
+    )
+    # Programs read the keys as ever.
+    assert json.loads(said(Form.JSON, missing=(0, 0, 0)))["missing"] == [0, 0, 0]
+
+
+def test_a_person_reads_a_finding_once_in_the_conclusion() -> None:
+    for form, count in ((Form.TEXT, 0), (Form.JSON, 1)):
+        stream = io.StringIO()
+        journal = Journal(stream, form, lambda: AT)
+        journal.say(Level.INFO, "found", text="J3 has friction by load", in_short=True)
+        assert stream.getvalue().count("J3 has friction by load") == count
+
+
 def test_numbers_that_json_cannot_say_are_null() -> None:
     assert json.loads(said(Form.JSON, gain=math.nan, more=[math.inf, 1.0]))["more"] == [None, 1.0]
 

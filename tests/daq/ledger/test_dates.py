@@ -17,8 +17,9 @@ from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.ledger.audit import AuditAction, append
 from daq.ledger.dates import SET_CLOCK, longest_ordered, times_by_order
-from daq.ledger.fold import Entry, drives_of
+from daq.ledger.fold import Entry
 from daq.ledger.ledger import Ledger, enter_calibration, read_history
+from daq.ledger.names import drives_of
 from daq.ledger.watch import watch
 from ident.calibration import Calibration
 from tests.daq.calibrations import recorded

@@ -27,8 +27,9 @@ from daq.formats.scalar import rewrite_gain
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
-from daq.ledger.fold import Entry, Event, WriteAction, drives_of, logs_of, recorded_at
+from daq.ledger.fold import Entry, Event, WriteAction, logs_of, recorded_at
 from daq.ledger.ledger import acknowledge, enter_calibration, read_history
+from daq.ledger.names import drives_of
 from daq.ledger.watch import Point, Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
 from daq.writeback.file_access import resolve_links

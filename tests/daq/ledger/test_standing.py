@@ -169,3 +169,13 @@ def test_the_last_write_of_each_place_decides(
             expected = StandingState.REPLACED
         assert state(ledger, digest) is expected
     assert len(read(ledger.audit)) == 3 + 2 * len(steps)
+
+
+def test_of_two_places_the_last_write_counts_by_the_order_of_the_log(ledger: Ledger) -> None:
+    """The first one was written while the clock was two years ahead."""
+    digest = enter(ledger, calibration_of(0))
+    write(ledger, FILE, sha256(b"1"), digest=digest, at=BEGIN + timedelta(days=730))
+    write(ledger, COPY, sha256(b"1"), digest=digest, at=BEGIN + timedelta(hours=1))
+    standing = read_standing(ledger, digest, NOW)
+    assert standing.write is not None
+    assert standing.write.target == COPY

@@ -17,6 +17,8 @@ from daq.config.cell import Cell
 from daq.config.controller import Controller, GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger.ledger import Ledger, plan_rename, read_history, rename_cell
+from daq.ledger.names import drives_of
 from daq.writeback.drive_target import DriveEdit, DriveTarget, read_record, read_records, record_folder
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
@@ -510,6 +512,25 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
         * 3
     )
     assert verify(cell.history.audit).open_writes == ()
+
+
+def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    press = replace(cell, name="press")
+    ledger = Ledger.of(press)
+    assert ledger is not None
+    with simulated(address) as simulation:
+        _write(cell, address)
+        with (
+            network_of(press, address) as network,
+            pytest.raises(ControllerUnfit, match=r"a write to cell 'demo'; expected one to the drives of cell 'press'"),
+        ):
+            rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
+        rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=NOW)
+        with network_of(press, address) as network:
+            rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == IN_DRIVES
+    assert [event.target for event in read_history(ledger).events] == [drives_of("press")] * 2
 
 
 def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddress, tmp_path: Path) -> None:

@@ -1,0 +1,112 @@
+"""Names of cells in an audit log: a rename is an entry, and counts for the entries before it.
+
+Nothing in the log is rewritten. Whoever folds the log reads it under the names that its cells have now
+(`with_present_names`). What is entered later under the old name is of another cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from daq.ledger.audit import AuditAction, AuditEntry
+
+
+@dataclass(frozen=True, slots=True)
+class RenamedCell:
+    """A rename in an audit log."""
+
+    old: str
+    new: str
+    at: str  #: ISO 8601 time with its zone
+    robot: object  #: of the cell, as plain JSON; None where the entry lacks it
+
+
+def drives_of(cell: str) -> str:
+    """Return the name of a cell's drives in audit and history."""
+    return f"drives of cell {cell}"
+
+
+def rename_of(entry: AuditEntry) -> RenamedCell | None:
+    """Return the rename that an entry makes; None where it is another entry."""
+    old = entry.details.get("old_name")
+    new = entry.details.get("cell")
+    if entry.action is not AuditAction.RENAMED or not isinstance(old, str) or not isinstance(new, str):
+        return None
+    return RenamedCell(old, new, entry.at, entry.details.get("robot"))
+
+
+def with_present_names(entries: Sequence[AuditEntry]) -> Sequence[AuditEntry]:
+    """Return the entries with the names that their cells have now, and the digests that they have in the file."""
+    if all(one.action is not AuditAction.RENAMED for one in entries):
+        return entries
+    present: dict[str, str] = {}
+    found = []
+    for one in reversed(entries):
+        rename = rename_of(one)
+        if rename is not None:
+            # A rename itself stays as it was made.
+            present[rename.old] = present.get(rename.new, rename.new)
+            found.append(one)
+        else:
+            found.append(_under_present_name(one, present))
+    return tuple(reversed(found))
+
+
+def _under_present_name(one: AuditEntry, present: Mapping[str, str]) -> AuditEntry:
+    details = dict(one.details)
+    cell = details.get("cell")
+    if isinstance(cell, str):
+        details["cell"] = present.get(cell, cell)
+    calibration = details.get("calibration")
+    if isinstance(calibration, dict) and isinstance(calibration.get("cell"), str):
+        of_cell = calibration["cell"]
+        details["calibration"] = {**calibration, "cell": present.get(of_cell, of_cell)}
+    subjects = {drives_of(old): drives_of(new) for old, new in present.items()}
+    return replace(one, details=details, subject=subjects.get(one.subject, one.subject))
+
+
+def former_names(entries: Sequence[AuditEntry], cell: str) -> frozenset[str]:
+    """Return the names that a cell had before."""
+    names: set[str] = set()
+    for one in reversed(entries):
+        rename = rename_of(one)
+        if rename is not None and (rename.new == cell or rename.new in names):
+            names.add(rename.old)
+    return frozenset(names - {cell})
+
+
+def renamed_to(entries: Iterable[AuditEntry], cell: str) -> RenamedCell | None:
+    """Return the rename after which a cell has another name; None where it has its own, or got it back."""
+    found: RenamedCell | None = None
+    for one in entries:
+        rename = rename_of(one)
+        if rename is None:
+            continue
+        if rename.old == cell:
+            found = rename
+        elif rename.new == cell:
+            found = None
+    return found
+
+
+def cell_names(entries: Iterable[AuditEntry]) -> frozenset[str]:
+    """Return the names of all cells that something was entered for, by calibrations, writes or sessions."""
+    names: set[str] = set()
+    for one in entries:
+        if one.action is AuditAction.RENAMED:
+            continue
+        calibration = one.details.get("calibration")
+        of_calibration = calibration.get("cell") if isinstance(calibration, dict) else None
+        names |= {name for name in (one.details.get("cell"), of_calibration) if isinstance(name, str)}
+    return frozenset(names)
+
+
+def names_in(entries: Iterable[AuditEntry]) -> tuple[str, ...]:
+    """Return the names of the cells that have calibrations in an audit log, in the order in which they came."""
+    names: dict[str, None] = {}
+    for one in entries:
+        name = one.details.get("cell")
+        if one.action is AuditAction.CALIBRATION_ENTERED and isinstance(name, str):
+            names[name] = None
+    return tuple(names)

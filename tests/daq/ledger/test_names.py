@@ -1,0 +1,321 @@
+"""A history is of one robot: another one of its name is left out and named, and a renamed cell keeps its history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.same_cell import calibrated_robot
+from daq.documents.calibration_file import save_calibration
+from daq.documents.session_state import GuidedState
+from daq.errors import DataError, ExitCode
+from daq.files import sha256
+from daq.jobs.position import sessions_folder
+from daq.jobs.session import Basis, begin, rename_sessions, sessions
+from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger.ledger import (
+    Ledger,
+    acknowledge,
+    enter_calibration,
+    names_of,
+    plan_rename,
+    read_history,
+    read_standing,
+    record_session,
+    rename_cell,
+    verify_ledger,
+)
+from daq.ledger.names import drives_of
+from daq.ledger.watch import watch
+from ident.calibration import Calibration
+from tests.daq.histories import BEGIN, calibration_of, digest_of, ledger_in, write
+from tests.daq.killing import killed_where
+
+LATER = BEGIN + timedelta(weeks=10)
+FALLEN = (1.0, 1.0, 1.0, 0.8, 1.0, 1.0)  #: Gain of J4, 20 % less
+
+
+def _other_robot(cell: Cell) -> Cell:
+    """The same cell with another drive on J4."""
+    axis = cell.axes[3]
+    assert axis.identity is not None
+    exchanged = replace(axis, identity=replace(axis.identity, product_code=0x40300))
+    return replace(cell, axes=(*cell.axes[:3], exchanged, *cell.axes[4:]))
+
+
+def _made(cell: Cell, week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibration:
+    """A calibration that names its robot."""
+    return replace(calibration_of(week, factors), cell=cell.name, robot=calibrated_robot(cell))
+
+
+def _enter(ledger: Ledger, calibration: Calibration, week: int) -> str:
+    digest = digest_of(calibration)
+    at = BEGIN + timedelta(weeks=week)
+    enter_calibration(ledger, calibration, digest=digest, who="anna", at=at)
+    return digest
+
+
+def _named(ledger: Ledger, name: str) -> Ledger:
+    return replace(ledger, cell=replace(ledger.cell, name=name))
+
+
+@pytest.fixture
+def ledger(tmp_path: Path) -> Ledger:
+    """An empty ledger of the demo cell."""
+    return ledger_in(tmp_path)
+
+
+@pytest.fixture
+def renamed(ledger: Ledger) -> Ledger:
+    """The ledger of cell `press`, which was called demo and has three calibrations, a write and a session."""
+    digests = [_enter(ledger, _made(ledger.cell, week), week) for week in range(3)]
+    write(ledger, drives_of("demo"), sha256(b"1"), digest=digests[0], at=BEGIN)
+    acknowledge(ledger, "J1", since=BEGIN, at=BEGIN, who="anna", why="new gearbox")
+    details = {"session": "s", "cell": "demo", "calibration_sha256": digests[0]}
+    record_session(ledger.audit, AuditAction.ACCEPTED, at=BEGIN, who="anna", subject="s", details=details)
+    return _named(ledger, "press")
+
+
+def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
+    for week in range(3):
+        _enter(ledger, _made(ledger.cell, week), week)
+    other = replace(ledger, cell=_other_robot(ledger.cell))
+    with pytest.raises(DataError, match=r"drive of J4 with product code 0x40200; expected .*0x40300"):
+        _enter(other, _made(other.cell, 3, FALLEN), 3)
+    history = read_history(other)
+    assert history.entries == ()
+    assert watch(history.entries, history.acknowledgements) == ()
+    assert [one.entry.digest for one in history.other_robots] == [one.digest for one in read_history(ledger).entries]
+    said = str(history.other_robots[0])
+    assert "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200" in said
+    assert "expected drive of J4 with product code 0x40300, as in the cell file" in said
+    assert verify_ledger(other).unknown == ()
+
+
+def test_a_calibration_of_another_robot_is_not_entered(ledger: Ledger) -> None:
+    _enter(ledger, _made(ledger.cell, 0), 0)
+    with pytest.raises(DataError, match="another robot with the cell name 'demo'"):
+        _enter(ledger, _made(_other_robot(ledger.cell), 1, FALLEN), 1)
+    assert len(read(ledger.audit)) == 1
+
+
+def test_calibrations_of_earlier_versions_are_compared_as_before(ledger: Ledger) -> None:
+    _enter(ledger, calibration_of(0), 0)
+    _enter(ledger, _made(ledger.cell, 1), 1)
+    history = read_history(ledger)
+    assert [entry.robot is None for entry in history.entries] == [True, False]
+    assert history.other_robots == ()
+
+
+def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renamed: Ledger) -> None:
+    before = read_history(ledger)
+    lines = ledger.audit.read_bytes()
+    assert read_history(renamed).entries == ()
+    assert read_history(renamed).possible_names == ("demo",)
+    planned = plan_rename(renamed, "demo")
+    assert (planned.calibrations, planned.writes, planned.acknowledgements, planned.undescribed) == (3, 1, 1, 0)
+    assert ledger.audit.read_bytes() == lines
+    rename_cell(renamed, planned, who="anna", at=LATER)
+    # The chain is what it was, and one entry longer.
+    assert ledger.audit.read_bytes().startswith(lines)
+    assert verify(ledger.audit).holds
+    assert read(ledger.audit)[-1].action is AuditAction.RENAMED
+    after = read_history(renamed)
+    assert [replace(entry, cell="demo", events=()) for entry in after.entries] == [
+        replace(entry, events=()) for entry in before.entries
+    ]
+    assert [event.target for event in after.events] == [drives_of("press")]
+    assert after.acknowledgements == before.acknowledgements
+    assert after.acceptances == before.acceptances
+    assert after.in_force(drives_of("press")) == before.entries[0].digest
+    assert read_standing(renamed, before.entries[0].digest, LATER).state.value == "accepted"
+    assert verify_ledger(renamed).complete
+    # A change is judged against the baseline of the old name.
+    _enter(renamed, _made(renamed.cell, 11, FALLEN), 11)
+    history = read_history(renamed)
+    (of_j4,) = [one for one in watch(history.entries, history.acknowledgements) if one.axis == "J4"]
+    assert len(of_j4.points) == 4
+    assert of_j4.alarmed
+
+
+def test_what_is_entered_under_the_old_name_later_is_of_another_cell(ledger: Ledger, renamed: Ledger) -> None:
+    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    # The same robot, by a cell file that still has the old name.
+    with pytest.raises(DataError, match=r"'demo', which this robot had until .*expected 'press'"):
+        _enter(ledger, _made(ledger.cell, 11), 11)
+    # Another robot may take the name.
+    other = replace(ledger, cell=_other_robot(ledger.cell))
+    digest = _enter(other, _made(other.cell, 12), 12)
+    assert [entry.digest for entry in read_history(other).entries] == [digest]
+    assert len(read_history(renamed).entries) == 3
+
+
+def test_a_cell_may_be_renamed_twice_and_back(ledger: Ledger, renamed: Ledger) -> None:
+    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    third = _named(ledger, "press-4")
+    rename_cell(third, plan_rename(third, "press"), who="anna", at=LATER)
+    assert len(read_history(third).entries) == 3
+    back = plan_rename(ledger, "press-4")
+    rename_cell(ledger, back, who="anna", at=LATER)
+    assert len(read_history(ledger).entries) == 3
+    assert read_history(ledger).renamed is None
+    for left in (renamed, third):
+        history = read_history(left)
+        assert history.entries == ()
+        assert history.renamed is not None
+
+
+def test_a_rename_to_the_name_of_another_robot_is_refused(ledger: Ledger) -> None:
+    press = _named(ledger, "press")
+    _enter(ledger, _made(ledger.cell, 0), 0)
+    other = replace(press, cell=_other_robot(press.cell))
+    _enter(other, _made(other.cell, 0), 0)
+    lines = ledger.audit.read_bytes()
+    for wanted, name in ((press, "press"), (other, "demo")):
+        with pytest.raises(DataError, match=f"another robot with the cell name '{name}': found drive of J4"):
+            plan_rename(wanted, "demo")
+    assert ledger.audit.read_bytes() == lines
+
+
+def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(renamed: Ledger) -> None:
+    with pytest.raises(DataError, match="nothing of a cell 'dmeo'; cells in it: 'demo'"):
+        plan_rename(renamed, "dmeo")
+
+
+def test_nothing_is_renamed_in_a_log_that_was_changed(renamed: Ledger) -> None:
+    renamed.audit.write_bytes(renamed.audit.read_bytes().replace(b"new gearbox", b"old gearbox"))
+    with pytest.raises(DataError, match="not what was written"):
+        plan_rename(renamed, "demo")
+
+
+def _sessions_of(folder: Path, cell: str, count: int) -> None:
+    for number in range(count):
+        begin(folder, Basis(cell, "c" * 64, ""), BEGIN + timedelta(days=number), GuidedState)
+
+
+def test_sessions_get_the_new_name_unless_they_began_after_the_rename(tmp_path: Path) -> None:
+    _sessions_of(tmp_path, "demo", 3)
+    _sessions_of(tmp_path, "gantry", 1)
+    count = rename_sessions([tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1))
+    assert count == 2
+    assert len(sessions(tmp_path, "press")) == 2
+    assert len(sessions(tmp_path, "demo")) == 1
+    assert len(sessions(tmp_path, "gantry")) == 1
+
+
+def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(tmp_path: Path) -> None:
+    """Kill it at every eighth call: before the entry, in the middle of the sessions, and behind them."""
+
+    def prepared(folder: Path) -> tuple[Ledger, Callable[[], int]]:
+        folder.mkdir()
+        ledger = ledger_in(folder)
+        _enter(ledger, _made(ledger.cell, 0), 0)
+        _sessions_of(folder / "sessions", "demo", 3)
+        press = _named(ledger, "press")
+
+        def rename() -> int:
+            planned = plan_rename(press, "demo")
+            rename_cell(press, planned, who="anna", at=LATER)
+            rename_sessions([folder / "sessions"], "demo", "press", planned.entered_at or LATER)
+            return 0
+
+        return press, rename
+
+    _, warm_up = prepared(tmp_path / "warm")
+    warm_up()  # nothing is left to import
+    states = set()
+    call = 1
+    while True:
+        folder = tmp_path / str(call)
+        press, rename = prepared(folder)
+        killed = killed_where(lambda number, last=call: number >= last, rename)  # type: ignore[misc]
+        assert verify(press.audit).holds
+        has_entry = read_history(press).entries != ()
+        done = len(sessions(folder / "sessions", "press"))
+        states.add((has_entry, done))
+        assert len(sessions(folder / "sessions")) == 3
+        assert has_entry or done == 0
+        rename()
+        assert len(read_history(press).entries) == 1
+        assert len(sessions(folder / "sessions", "press")) == 3
+        assert sum(one.action is AuditAction.RENAMED for one in read(press.audit)) == 1
+        if not killed:
+            break
+        call += 8
+    assert {(False, 0), (True, 3)} <= states
+    assert states & {(True, 0), (True, 1), (True, 2)}
+
+
+@pytest.fixture
+def cell_file(checkout: Path, tmp_path: Path) -> Path:
+    """A demo cell, with two calibrations and a guided session under its name."""
+    text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8").replace("../", f"{checkout}/configs/")
+    path = tmp_path / "cell.yaml"
+    path.write_text(text, encoding="utf-8")
+    ledger = Ledger.of(load_cell(path))
+    assert ledger is not None
+    for week in range(2):
+        _enter(ledger, _made(ledger.cell, week), week)
+    _sessions_of(sessions_folder(path), "demo", 1)
+    return path
+
+
+def test_the_verb_shows_a_rename_and_makes_it_with_yes(
+    cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1))
+    audit = cell_file.with_name("cell.audit.jsonl")
+    lines = audit.read_bytes()
+    assert main(["history", str(cell_file)]) == ExitCode.OK
+    assert f"`drivegain history {cell_file} --rename demo`" in caplog.text
+    capsys.readouterr()
+    assert main(["history", str(cell_file), "--rename", "demo"]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session." in said
+    assert audit.read_bytes() == lines
+    assert len(sessions(sessions_folder(cell_file), "demo")) == 1
+    assert main(["history", str(cell_file), "--rename", "demo", "--yes", "--json"]) == ExitCode.OK
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["calibrations"] == 2
+    assert "drivegain-recalibrate-demo.timer" in captured.err
+    assert len(sessions(sessions_folder(cell_file), "press")) == 1
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert names_of(load_cell(cell_file)) == {"press", "demo"}
+    # A copy of the cell file with the old name, as a schedule may have.
+    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1))
+    assert main(["history", str(cell_file)]) == ExitCode.OK
+    assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
+
+
+def test_the_verb_says_in_what_another_robot_differs(
+    cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("0x00040200", "0x00040300"))
+    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
+    report = json.loads(capsys.readouterr().out)
+    assert report["calibrations"] == 0
+    assert len(report["other_robots"]) == 2
+    assert "drive of J1 with product code 0x40200" in report["other_robots"][0]
+    assert "J3 with product code 0x40200; and 3 more; expected" in report["other_robots"][0]
+    assert "no change of a gain is computed with it" in caplog.text
+    # Nor may its calibration be entered beside the others.
+    own = cell_file.with_name("calibration.yaml")
+    save_calibration(_made(load_cell(cell_file), 5), own)
+    assert main(["history", str(cell_file), "--add", str(own)]) == ExitCode.DATA_UNFIT
+
+
+@pytest.mark.parametrize("options", [["--rename", "demo"], ["--yes"]])
+def test_the_verb_needs_an_earlier_name(
+    options: list[str], cell_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["history", str(cell_file), *options]) == ExitCode.USAGE
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--rename" in said
