@@ -26,7 +26,7 @@ NEEDS = re.compile(r"^<!-- needs: (\S+) -->$", re.MULTILINE)
 PROMPT = "$ "
 PROGRAMS = ("drivegain", "pip", "python", "python3", "make", "sudo", "ip", "cat", "echo", "mkdir", "dask", "git")
 COMMAND = re.compile(rf"^(?:[A-Z_]+=\S+ )*(?:{'|'.join(PROGRAMS)}|\S*bin/\S+) .*$")
-INLINE = re.compile(r"(?<!`)`(drivegain [a-z][^`\n]*)`(?!`)")
+INLINE = re.compile(r"(?<![`\\])`(drivegain [a-z][^`\n]*)`(?!`)")
 
 
 class State(Enum):

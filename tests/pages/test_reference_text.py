@@ -31,8 +31,5 @@ def test_a_page_and_a_schema_that_lag_behind_are_named(checkout: Path, tmp_path:
     gates.write_text(gates.read_text(encoding="utf-8").replace("| signature |", "| autograph |"), encoding="utf-8")
     (reference / "schemas" / "error.json").unlink()
     (reference / "schemas" / "gone.json").write_text("{}\n")
-    assert lagging_files(tmp_path) == [
-        "docs/reference/gates.md",
-        "docs/reference/schemas/error.json",
-        "docs/reference/schemas/gone.json",
-    ]
+    names = [Path(line).name for line in lagging_files(tmp_path)]
+    assert names == ["gates.md", "error.json", "gone.json"]
