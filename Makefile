@@ -12,18 +12,20 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make test-slow  searches, plans and sessions on whole simulated recordings; 13 minutes of processor time"
-	@echo "make test-processes  whole jobs: the tutorial followed to the letter, jobs that are killed, two buses, real recordings"
+	@echo "make test-processes  whole jobs: jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings, screenshots in out/console; the certificate on paper"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
-	@echo "make test-docs  the Python of every page, and how many blocks and commands a test runs; a minute"
+	@echo "make test-docs  every command of every page: the tutorial to the letter, then the pages that continue it; the Python of every page; minutes"
+	@echo "make reference  write what the pages take from the code into docs/ (verbs, keys, schemas, errors, gates, API); seconds"
+	@echo "make sizes   write what drivegain and its extras take on disk into docs/install.md; seconds"
 	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
@@ -144,7 +146,13 @@ docs: setup
 
 test-docs: setup
 	$(BIN)/python -m tests.pages
-	$(BIN)/python -m pytest -q tests/pages
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder tests/pages
+
+reference: setup
+	$(BIN)/python -m docs.reference_pages
+
+sizes: setup
+	$(BIN)/python -m docs.sizes
 
 # The pictures are committed: a build of the site runs no robot.
 screenshots: demo test-console

@@ -1,7 +1,10 @@
-"""Sphinx extension that fills the reference pages from the code, so that they cannot disagree with it.
+"""Text of the reference pages that is made of the code, and a Sphinx extension that refuses a page that lags behind.
 
-A page asks for a part with a line of its own, ``<!-- generated: NAME -->``; `PARTS` maps each name to a function that
-returns Markdown. The JSON schemas of the file formats are written beside the pages, into ``schemas/``.
+    python -m docs.reference_pages            writes it into the pages, and the JSON schemas into docs/reference/schemas
+    python -m docs.reference_pages --check    names the files that are not up to date
+
+A page has a part between the lines ``<!-- generated: NAME -->`` and ``<!-- generated until here -->``; `PARTS` maps
+each name to a function that returns Markdown.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ import importlib
 import inspect
 import json
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
+from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +23,7 @@ from typing import Any
 import typer
 from pydantic import TypeAdapter
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 
 from daq.cli.app import build_app
 from daq.cli.verb import help_record
@@ -64,31 +70,63 @@ NO_DOCSTRING = {
     "drivers.CIA402": "The drive profile of CiA 402, without what a maker adds.",
 }
 """What exported values are, which have no docstring of their own."""
-MARK = re.compile(r"^<!-- generated: ([a-z ]+) -->$", re.MULTILINE)
+HERE = Path(__file__).resolve().parent
+SCHEMA_FOLDER = HERE / "reference" / "schemas"
+UNTIL = "<!-- generated until here -->"
+MARK = re.compile(rf"^(<!-- generated: ([a-z ]+) -->)\n.*?^{re.escape(UNTIL)}$", re.MULTILINE | re.DOTALL)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the hooks."""
-    app.connect("source-read", _fill)
-    app.connect("build-finished", _write_schemas)
+    app.connect("source-read", _require_current)
+    app.connect("build-finished", _publish_schemas)
     # Before napoleon (priority 500), which adds markup of its own.
     app.connect("autodoc-process-docstring", _escape_docstring, priority=400)
     app.connect("autodoc-process-signature", _shorten_types)
     return {"parallel_read_safe": True}
 
 
-def _fill(_app: Sphinx, _name: str, source: list[str]) -> None:
-    source[0] = MARK.sub(lambda mark: PARTS[mark[1]](), source[0])
+def filled(page: str) -> str:
+    """The text of a page with its generated parts as the code has them now."""
+    return MARK.sub(lambda mark: f"{mark[1]}\n\n{PARTS[mark[2]]()}\n\n{UNTIL}", page)
 
 
-def _write_schemas(app: Sphinx, error: Exception | None) -> None:
+def schema_texts() -> dict[str, str]:
+    """The JSON schemas, by the names of their files."""
+    texts = {}
+    for name, (title, model) in SCHEMAS.items():
+        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **_schema(model), "title": title}
+        texts[f"{name}.json"] = json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
+    return texts
+
+
+def lagging() -> dict[Path, str | None]:
+    """Files that are not as the code has them, with the text that they should have; None: the file should go."""
+    wanted = {path: filled(path.read_text(encoding="utf-8")) for path in sorted(HERE.rglob("*.md"))}
+    schemas = {SCHEMA_FOLDER / name: text for name, text in schema_texts().items()}
+    texts = {**wanted, **schemas}
+    found: dict[Path, str | None] = {path: text for path, text in texts.items() if not _is_current(path, text)}
+    found.update({path: None for path in SCHEMA_FOLDER.glob("*.json") if path not in schemas})
+    return found
+
+
+def _is_current(path: Path, text: str) -> bool:
+    return path.exists() and path.read_text(encoding="utf-8") == text
+
+
+def _require_current(_app: Sphinx, name: str, source: list[str]) -> None:
+    if filled(source[0]) != source[0]:
+        raise ExtensionError(f"docs/{name}.md: its generated text is not that of the code; run `make reference`")
+
+
+def _publish_schemas(app: Sphinx, error: Exception | None) -> None:
+    """Copy the schemas to the address that they have on the site."""
     if error is not None or app.builder.format != "html":
         return
     folder = Path(app.outdir) / "schemas"
     folder.mkdir(exist_ok=True)
-    for name, (title, model) in SCHEMAS.items():
-        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **_schema(model), "title": title}
-        (folder / f"{name}.json").write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")
+    for name, text in schema_texts().items():
+        (folder / name).write_text(text, encoding="utf-8")
 
 
 def _escape_docstring(_app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
@@ -161,9 +199,8 @@ def cell_file() -> str:
 
 def schema_list() -> str:
     """Links to the JSON schemas."""
-    return "\n".join(
-        f'- <a href="../schemas/{name}.json">{name}.json</a>: {title.lower()}' for name, (title, _) in SCHEMAS.items()
-    )
+    lines = [f"- [{name}.json](schemas/{name}.json): {title.lower()}" for name, (title, _) in SCHEMAS.items()]
+    return "\n".join(lines)
 
 
 def _schema(model: Any) -> dict[str, Any]:
@@ -308,18 +345,26 @@ def _page_of(package: str, module: str) -> str:
 
 def api(page: str) -> str:
     """Everything that a page of the API describes: functions, then classes."""
-    functions, classes, others = [], [], []
+    rows = ["| name | |", "|---|---|"]
+    functions: list[str] = []
+    classes: list[str] = []
+    others: list[str] = []
     for full_name in api_names(page):
         package, _, name = full_name.partition(".")
         exported = getattr(importlib.import_module(package), name)
         if inspect.isclass(exported):
-            classes.append(f".. autoclass:: {full_name}\n   :members:")
+            # Names of an enumeration say what they are, and have no docstrings.
+            members = ":members:\n   :undoc-members:" if issubclass(exported, Enum) else ":members:"
+            classes.append(f".. autoclass:: {full_name}\n   {members}")
         elif inspect.isfunction(exported):
             functions.append(f".. autofunction:: {full_name}")
         else:
             others.append(f".. py:data:: {full_name}\n\n   {NO_DOCSTRING[full_name]}")
+        summary = NO_DOCSTRING.get(full_name) or _summary(exported)
+        rows.append(f"| `{name}` | {_escaped(summary)} |")
+    table = "\n".join(rows)
     directives = "\n\n".join([*functions, *classes, *others])
-    return f"```{{eval-rst}}\n{directives}\n```"
+    return f"{table}\n\n```{{eval-rst}}\n{directives}\n```"
 
 
 def gates() -> str:
@@ -359,3 +404,22 @@ PARTS: dict[str, Callable[[], str]] = {
     "effects": effects,
 }
 """What a page can ask for."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write what lags behind, or with `--check` name it only."""
+    found = lagging()
+    SCHEMA_FOLDER.mkdir(exist_ok=True)
+    for path, text in found.items():
+        sys.stdout.write(f"{path.relative_to(HERE.parent)}\n")
+        if "--check" in arguments:
+            continue
+        if text is None:
+            path.unlink()
+        else:
+            path.write_text(text, encoding="utf-8")
+    return int("--check" in arguments and bool(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -34,6 +34,10 @@ def main(address: str, pacing: drivers.LockstepSync | drivers.TimedSync, samples
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(
+            "error: found no address of a bus, or several; expected one, as in: stream_from_a_bus.py socketcan:can0"
+        )
     try:
         main(sys.argv[1], drivers.TimedSync(period_ns=10_000_000))
     except drivers.DriverError as error:  # every error of the bus and the drives has this root

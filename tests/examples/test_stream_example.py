@@ -44,6 +44,14 @@ def test_an_absent_bus_is_an_error_in_one_line(checkout: Path) -> None:
     assert len(ended.stderr.splitlines()) == 1
 
 
+def test_without_an_address_the_example_says_how_one_looks(checkout: Path) -> None:
+    command = [sys.executable, str(checkout / "examples/stream_from_a_bus.py")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, cwd=checkout)
+    assert ended.returncode == 1
+    assert "socketcan:can0" in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+
+
 def test_every_name_of_the_front_door_is_there_and_nothing_is_loaded_before() -> None:
     for name in drivers.__all__:
         assert getattr(drivers, name).__module__.startswith("drivers.") or name == "CIA402"

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from docs.reference_pages import API_PAGES, api_names
-from tests.pages.blocks import blocks_of, pages, python_before
+from tests.pages.blocks import blocks_of, needed_packages, pages, python_before
 
 ROOT = Path(__file__).parents[2]
 WITH_PYTHON = [
@@ -25,6 +25,8 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pyte
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     monkeypatch.syspath_prepend(str(tmp_path))
     source = page.read_text(encoding="utf-8")
+    for package in needed_packages(source):
+        pytest.importorskip(package)
     module = ModuleType("page")  # a class of the page is in a module, as the reader's is
     monkeypatch.setitem(sys.modules, "page", module)
     names = vars(module)
