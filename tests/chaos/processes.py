@@ -24,7 +24,8 @@ from functools import partial
 from pathlib import Path
 
 from daq.simulation.simulation_file import load_simulation
-from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.bus import BusAddress, bus_errors, open_bus
+from drivers.errors import BusError
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.hub import Hub
 from drivers.simulation.node import Node
@@ -36,6 +37,7 @@ from tests.vcan.run import INTERFACE
 
 SOCKETCAN, SOCKETCAND = "socketcan", "socketcand"
 READY = "ready"
+BUS_LOST = 5  #: Exit code of a cell whose bus is gone
 ABORT = 0x08000022  #: "because of the present device state"
 SDO_REQUEST, SDO_ANSWER, SYNC = 0x600, 0x580, 0x080
 ANSWER_S = 1.0
@@ -110,12 +112,16 @@ def serve_cell(truth: Path, bus: ChaosBus, aborts: Collection[tuple[int, int, in
     address = BusAddress(SOCKETCAN, INTERFACE)
     if bus.port is not None:
         address = BusAddress(SOCKETCAND, HUB_CHANNEL, port=bus.port)
-    with suppress(KeyboardInterrupt), open_bus(address, answering=True) as end:
-        cell = SimulatedCell(load_simulation(truth), end)
-        for node, index, subindex in aborts:
-            _refuse(cell.nodes[node - 1], (index, subindex), shared)
-        print(READY, flush=True)  # noqa: T201
-        cell.serve_forever()
+    try:
+        with suppress(KeyboardInterrupt), open_bus(address, answering=True) as end, bus_errors(address):
+            cell = SimulatedCell(load_simulation(truth), end)
+            for node, index, subindex in aborts:
+                _refuse(cell.nodes[node - 1], (index, subindex), shared)
+            os.write(1, f"{READY}\n".encode())
+            cell.serve_forever()
+    except BusError as error:  # the interface is down
+        os.write(1, f"{error}\n".encode())
+        return BUS_LOST
     return 0
 
 

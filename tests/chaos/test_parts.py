@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -17,9 +18,10 @@ from tests.chaos.clock import BUILT
 from tests.chaos.ends import EXTENDED, ChaosBus
 from tests.chaos.faults import KERNEL_ONLY, NEEDS_CLOCK, Act, Fault, Inside
 from tests.chaos.judge import Round
-from tests.chaos.processes import Objects, Verb
+from tests.chaos.processes import BUS_LOST, READY, Objects, Shared, Verb, hub_running, serve_cell
 from tests.chaos.results import Row, append_row, read_rows
 from tests.chaos.screens import Screen, plain, screen_of
+from tests.vcan.cells import write_simulation
 from tests.vcan.listener import HUB_CHANNEL, Frame, frames_of_hub, heard, listening
 
 ROOT = Path(__file__).parents[2]
@@ -178,3 +180,31 @@ def test_a_hub_has_all_acts_but_those_of_the_kernel() -> None:
     assert ChaosBus().absent == frozenset()
     assert ChaosBus(1234).absent == KERNEL_ONLY
     assert not KERNEL_ONLY & NEEDS_CLOCK
+
+
+def test_a_cell_whose_bus_is_gone_ends_without_a_traceback(tmp_path: Path) -> None:
+    truth = write_simulation(tmp_path, 20_000)
+    with Hub((HUB_CHANNEL,)) as hub:
+        bus = ChaosBus(hub.address().port)
+        cell = Verb.start(tmp_path / "cell.txt", lambda: serve_cell(truth, bus, (), Shared()))
+        assert until(lambda: READY in cell.said)
+    assert cell.wait(PATIENCE_S)
+    assert cell.code == BUS_LOST
+    assert "Traceback" not in cell.said
+    assert str(bus.port) in cell.said
+
+
+def test_an_sdo_abort_meets_one_object_while_it_is_in_force(tmp_path: Path) -> None:
+    truth = write_simulation(tmp_path, 20_000)
+    shared = Shared()
+    with hub_running() as bus:
+        cell = Verb.start(tmp_path / "cell.txt", lambda: serve_cell(truth, bus, ((2, 0x6041, 0),), shared))
+        assert until(lambda: READY in cell.said)
+        objects = Objects(bus)
+        assert objects.read(2, 0x6041, 0) is not None
+        shared.aborting = True
+        assert objects.read(2, 0x6041, 0) is None
+        assert objects.read(1, 0x6041, 0) is not None
+        assert objects.read(2, 0x6061, 0) is not None
+        objects.close()
+        assert cell.end(signal.SIGINT) == 0
