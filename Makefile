@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean
+.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -21,6 +21,7 @@ help:
 	@echo "make test-processes  whole jobs: jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"
+	@echo "make chaos-hub the same over a hub on this machine, where there is no SocketCAN; RESULTS=FILE goes on behind its last round"
 	@echo "make test-console  the live console in headless Chromium beside whole recordings, screenshots in out/console; the certificate on paper"
 	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
 	@echo "make test-docs  every command of every page: the tutorial to the letter, then the pages that continue it; the Python of every page; minutes"
@@ -116,6 +117,12 @@ test-vcan: setup vcan-tools
 chaos: setup vcan-tools
 	@mkdir -p out
 	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.chaos \
+		$(if $(SEED),--seed $(SEED)) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(ROUND),--round $(ROUND))
+
+# The same over a hub on 127.0.0.1, on any machine; RESULTS=FILE keeps a row for each round and goes on behind the last.
+chaos-hub: setup
+	@mkdir -p out
+	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.chaos --hub $(if $(RESULTS),--results $(RESULTS)) \
 		$(if $(SEED),--seed $(SEED)) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(ROUND),--round $(ROUND))
 
 # What brings a kernel with vcan where this one has none.

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import Empty, Queue, SimpleQueue
+from types import MethodType
 from typing import cast
 
 import can
@@ -24,7 +25,7 @@ from can.interfaces.virtual import VirtualBus
 from can.typechecking import CanFilter
 
 from drivers.canopen.interfaces import SOCKETCAN, SOCKETCAND, VIRTUAL, BusInterface, interface_of
-from drivers.canopen.socketcan import BurstBus, open_socketcan
+from drivers.canopen.socketcan import BurstBus, open_socketcan, receive_within
 from drivers.errors import BusError
 
 CONNECT_TIMEOUT_S = 5.0
@@ -111,7 +112,7 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
             return VirtualEnd(address.channel)
         try:
             # A user's python-can configuration file must not change the cell's configuration.
-            return can.Bus(
+            bus = can.Bus(
                 interface=address.interface,
                 channel=address.channel,
                 bitrate=address.bitrate_bit_s,
@@ -121,6 +122,9 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
             )
         except (ValueError, TypeError, ImportError, NotImplementedError) as error:
             raise BusError(str(address), str(error)) from error
+        # Each interface has a class of its own; the waiting alone is replaced, on the object.
+        bus.recv = MethodType(receive_within, bus)  # type: ignore[method-assign]
+        return bus
 
 
 def base_frame(cob_id: int, data: bytes = b"") -> can.Message:

@@ -130,6 +130,25 @@ def open_socketcan(
     return SocketcanBus(channel, handle, backlog_records, remarks)
 
 
+def receive_within(bus: can.BusABC, timeout: float | None = None) -> can.Message | None:
+    """Return the next frame of a bus; None if none comes within a time [s].
+
+    This is `can.BusABC.recv` by the monotonic clock. The one of python-can waits by the wall clock: one that is set
+    back meanwhile makes it wait so much longer, and SYNC is not sent until then.
+    """
+    left_s = timeout
+    end_s = None if timeout is None else time.monotonic() + timeout
+    while True:
+        message, already_filtered = bus._recv_internal(timeout=left_s)
+        if message is not None and (already_filtered or bus._matches_filters(message)):
+            return message
+        if end_s is None:
+            continue
+        left_s = end_s - time.monotonic()
+        if left_s <= 0.0:
+            return None
+
+
 class BurstBus(can.BusABC):
     """A bus of which one call reads a burst; its other frames are returned without python-can's clock and logging."""
 
@@ -142,7 +161,7 @@ class BurstBus(can.BusABC):
     def recv(self, timeout: float | None = None) -> can.Message | None:
         if self._received and self._filters is None:
             return self._received.popleft()
-        return super().recv(timeout)
+        return receive_within(self, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._received:

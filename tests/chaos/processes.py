@@ -6,31 +6,50 @@ whose one processor all processes share. From there on it is a process like any 
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import importlib
+import mmap
 import os
-import select
 import signal
-import socket
 import struct
 import sys
+import termios
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from daq.cli.app import main
 from daq.simulation.simulation_file import load_simulation
-from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.bus import BusAddress, bus_errors, open_bus
+from drivers.errors import BusError
 from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.hub import Hub
+from drivers.simulation.node import Node
+from drivers.simulation.spec import SdoAbort
+from tests.chaos.clock import StepClock
+from tests.chaos.ends import ChaosBus
+from tests.vcan.listener import HUB_CHANNEL
 from tests.vcan.run import INTERFACE
 
-FRAME = struct.Struct("=IB3x8s")
+SOCKETCAN, SOCKETCAND = "socketcan", "socketcand"
+READY = "ready"
+BUS_LOST = 5  #: Exit code of a cell whose bus is gone
+ABORT = 0x08000022  #: "because of the present device state"
 SDO_REQUEST, SDO_ANSWER, SYNC = 0x600, 0x580, 0x080
 ANSWER_S = 1.0
 POLL_S = 0.01
-USED = ("daq.cli.record", "daq.cli.scan", "daq.cli.simulate", "daq.report.bus_views", "daq.workflow.record")
+USED = (
+    "daq.cli.apply",
+    "daq.cli.history",
+    "daq.cli.record",
+    "daq.cli.scan",
+    "daq.report.bus_views",
+    "daq.workflow.record",
+)
 
 
 def warm_up(simulation: Path) -> None:
@@ -42,35 +61,123 @@ def warm_up(simulation: Path) -> None:
     gc.freeze()
 
 
+class Shared:
+    """What the parent tells processes of a round while they run, in shared memory."""
+
+    def __init__(self) -> None:
+        self._memory = mmap.mmap(-1, mmap.PAGESIZE)
+
+    @property
+    def aborting(self) -> bool:
+        """Whether the cell's SDO aborts are in force: they meet the recorder alone."""
+        return self._memory[0] != 0
+
+    @aborting.setter
+    def aborting(self, value: bool) -> None:
+        self._memory[0] = int(value)
+
+
+def serve_hub(port_end: int) -> int:
+    """Run a hub until the process is killed; its port is written into a pipe."""
+    with Hub((HUB_CHANNEL,)) as hub, os.fdopen(port_end, "w", encoding="ascii") as pipe:
+        pipe.write(f"{hub.address().port}\n")
+        pipe.flush()
+        while True:
+            signal.pause()
+
+
+@contextmanager
+def hub_running() -> Iterator[ChaosBus]:
+    """Give a bus of a hub in a process of its own."""
+    read_end, write_end = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(read_end)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is killed at the end
+        serve_hub(write_end)
+        os._exit(1)
+    os.close(write_end)
+    try:
+        with os.fdopen(read_end, encoding="ascii") as pipe:
+            yield ChaosBus(int(pipe.readline()))
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+
+
+def serve_cell(truth: Path, bus: ChaosBus, aborts: Collection[tuple[int, int, int]], shared: Shared) -> int:
+    """Run the simulated cell until SIGINT; `aborts` has node, index and sub-index of what is refused by SDO."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    address = BusAddress(SOCKETCAN, INTERFACE)
+    if bus.port is not None:
+        address = BusAddress(SOCKETCAND, HUB_CHANNEL, port=bus.port)
+    try:
+        with suppress(KeyboardInterrupt), open_bus(address, answering=True) as end, bus_errors(address):
+            cell = SimulatedCell(load_simulation(truth), end)
+            for node, index, subindex in aborts:
+                _refuse(cell.nodes[node - 1], (index, subindex), shared)
+            os.write(1, f"{READY}\n".encode())
+            cell.serve_forever()
+    except BusError as error:  # the interface is down
+        os.write(1, f"{error}\n".encode())
+        return BUS_LOST
+    return 0
+
+
+def _refuse(node: Node, key: tuple[int, int], shared: Shared) -> None:
+    """Let a node abort each reading and writing of an object while aborts are in force."""
+    server = node._sdo
+    for name in ("_read", "_write"):
+        sound = getattr(server, name)
+        setattr(server, name, partial(_refused, sound, key, shared))
+
+
+def _refused(
+    sound: Callable[..., object], key: tuple[int, int], shared: Shared, index: int, subindex: int, *data: bytes
+) -> object:
+    if shared.aborting and (index, subindex) == key:
+        raise SdoAbort(ABORT)
+    return sound(index, subindex, *data)
+
+
 @dataclass
 class Verb:
-    """A verb of drivegain in a process of its own."""
+    """A verb of drivegain, or another part of a round, in a process of its own."""
 
     pid: int  #: of the process; also of its group
     words: Path  #: file with what it says
     code: int | None = None  #: exit code, minus the signal that ended it, None while it runs
 
     @classmethod
-    def start(cls, words: Path, arguments: Sequence[str]) -> Verb:
-        """Fork."""
+    def start(
+        cls, words: Path, job: Callable[[], int], screen: int | None = None, clock: StepClock | None = None
+    ) -> Verb:
+        """Fork.
+
+        Args:
+            words: file for what it says, unless it has a screen.
+            job: its work; returns the exit code.
+            screen: descriptor of its screen, a pipe or the end of a terminal.
+            clock: its wall clock.
+        """
         sys.stdout.flush()
         pid = os.fork()
         if pid == 0:
             code = 1
             try:
-                os.setpgid(0, 0)
-                with words.open("wb") as out:
-                    os.dup2(out.fileno(), 1)
-                    os.dup2(out.fileno(), 2)
-                os.closerange(3, 64)
-                code = main(arguments)
+                if clock is not None:
+                    clock.adopt()
+                _begin(words, screen)
+                code = job()
             except SystemExit as leaving:
                 code = leaving.code if isinstance(leaving.code, int) else 1
             except Exception:
                 traceback.print_exc()
                 raise
             finally:
-                sys.stdout.flush()
+                with suppress(OSError, ValueError):
+                    sys.stdout.flush()
                 os._exit(code)
         return cls(pid, words)
 
@@ -113,25 +220,27 @@ class Verb:
         return self.code
 
 
-def raw(filters: Sequence[tuple[int, int]] = ()) -> socket.socket:
-    """An end of the bus that receives the base data frames of these identifiers and masks alone."""
-    end = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-    packed = b"".join(struct.pack("=II", *one) for one in filters)
-    end.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
-    end.bind((INTERFACE,))
-    return end
-
-
-def frame(identifier: int, data: bytes = b"") -> bytes:
-    """The bytes of a frame."""
-    return FRAME.pack(identifier, len(data), data.ljust(8, b"\0"))
+def _begin(words: Path, screen: int | None) -> None:
+    """Make a fork a process group or, at a terminal, a session; what it says goes to its screen or file."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # chaos itself handles it
+    if screen is None:
+        os.setpgid(0, 0)
+        screen = os.open(words, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    elif os.isatty(screen):
+        os.setsid()
+        fcntl.ioctl(screen, termios.TIOCSCTTY, 0)
+    else:
+        os.setpgid(0, 0)
+    os.dup2(screen, 1)
+    os.dup2(screen, 2)
+    os.closerange(3, 64)
 
 
 class Objects:
     """Object dictionaries of the nodes, read over a socket of its own; objects of at most four bytes."""
 
-    def __init__(self) -> None:
-        self._end = raw(((SDO_ANSWER, 0xC000_0780),))
+    def __init__(self, bus: ChaosBus) -> None:
+        self._end = bus.end(((SDO_ANSWER, 0x780),))
 
     def close(self) -> None:
         """Close the socket."""
@@ -144,12 +253,13 @@ class Objects:
             TimeoutError: the node does not answer.
         """
         key = struct.pack("<HB", index, subindex)
-        self._end.send(frame(SDO_REQUEST + node, b"\x40" + key + bytes(4)))
+        self._end.drain()  # of answers to the recorder
+        self._end.send(SDO_REQUEST + node, b"\x40" + key + bytes(4))
         deadline_s = time.monotonic() + ANSWER_S
-        while (left_s := deadline_s - time.monotonic()) > 0 and select.select((self._end,), (), (), left_s)[0]:
-            identifier, _, data = FRAME.unpack(self._end.recv(FRAME.size))
-            if identifier == SDO_ANSWER + node and data[1:4] == key:
-                return None if data[0] == 0x80 else int.from_bytes(data[4:8], "little")
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            for identifier, data in self._end.hear(left_s):
+                if identifier == SDO_ANSWER + node and data[1:4] == key:
+                    return None if data[0] == 0x80 else int.from_bytes(data[4:8], "little")
         raise TimeoutError(f"node {node} does not answer to {index:04X}h:{subindex}")
 
     def settings(self, node: int) -> tuple[int | None, ...]:
@@ -166,5 +276,5 @@ class Objects:
     def syncs(self, number: int) -> None:
         """Let the cell's time pass."""
         for _ in range(number):
-            self._end.send(frame(SYNC))
+            self._end.send(SYNC)
             time.sleep(0.001)

@@ -7,9 +7,8 @@ from itertools import islice
 
 import pytest
 
-from drivers.simulation.faults import FaultKind
-from tests.chaos.faults import CYCLES, INSIDE, Act, Fault, rounds
-from tests.chaos.rounds import ALLOWANCE_S, STOPS, Round, judge_end, judge_stop
+from tests.chaos.faults import CYCLES, KINDS, Act, Fault, Inside, rounds
+from tests.chaos.judge import ALLOWANCE_S, STOPS, Round, judge_code, judge_end, judge_stop
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
 
@@ -17,7 +16,7 @@ MOVED_NS, STRUCK_NS, CYCLE_NS = 1_000_000_000, 2_000_000_000, 20_000_000
 ENABLED, DISABLED = 0x0627, 0x0250
 
 
-def fault(kind: Act | FaultKind, for_s: float = 0.2, cycles: int | None = 40, times: int = 10) -> Fault:
+def fault(kind: Act | Inside, for_s: float = 0.2, cycles: int | None = 40, times: int = 10) -> Fault:
     """A fault in motion; one of the cell begins when an act would strike."""
     at_cycle = (STRUCK_NS - MOVED_NS) // CYCLE_NS
     return Fault(kind, True, 1.0, for_s, node=3, times=times, gap_s=0.0, value=1, at_cycle=at_cycle, cycles=cycles)
@@ -37,7 +36,7 @@ def outcome(made: Fault, enabled_s: float, code: int = 5) -> Round:
 def test_a_seed_gives_the_same_rounds_and_every_kind_comes_once_in_a_turn() -> None:
     some = [one for faults in islice(rounds(1), 200) for one in faults]
     assert some == [one for faults in islice(rounds(1), 200) for one in faults]
-    kinds = [*Act, *INSIDE]
+    kinds = KINDS
     for begin in range(0, len(some) - len(kinds), len(kinds)):
         assert {one.kind for one in some[begin : begin + len(kinds)]} == set(kinds)
     assert {one.at_cycle for one in some} <= set(CYCLES)
@@ -45,7 +44,7 @@ def test_a_seed_gives_the_same_rounds_and_every_kind_comes_once_in_a_turn() -> N
 
 
 @pytest.mark.parametrize("kind", STOPS, ids=lambda kind: kind.name)
-def test_an_axis_that_is_enabled_beyond_the_bound_is_found(kind: Act | FaultKind) -> None:
+def test_an_axis_that_is_enabled_beyond_the_bound_is_found(kind: Act | Inside) -> None:
     made = fault(kind)
     bound_s = STOPS[kind].bound_s + (made.for_s if STOPS[kind].lasts else 0.0) + ALLOWANCE_S
     for enabled_s, expected in ((bound_s - 0.05, 0), (bound_s + 0.05, 1)):
@@ -57,24 +56,26 @@ def test_an_axis_that_is_enabled_beyond_the_bound_is_found(kind: Act | FaultKind
 @pytest.mark.parametrize("kind", STOPS, ids=lambda kind: kind.name)
 @pytest.mark.parametrize("code", [0, 4])
 def test_a_recording_that_came_to_its_end_after_a_fault_that_must_stop_it_is_found(
-    kind: Act | FaultKind, code: int
+    kind: Act | Inside, code: int
 ) -> None:
     judged = outcome(fault(kind), 0.01, code)
     judge_end(judged)
+    judge_code(judged)
     assert [line[:27] for line in judged.violations] == [f"(e) exit code {code} after {judged.faults[0].name}"[:27]]
     before = outcome(fault(kind), 0.01, code)
     before.moved_ns = STRUCK_NS + 1
     judge_end(before)
+    judge_code(before)
     assert before.violations == []
 
 
 @pytest.mark.parametrize(
     ("made", "demanded"),
     [
-        (fault(FaultKind.LOST, cycles=2), False),
-        (fault(FaultKind.LOST, cycles=6), True),
-        (fault(FaultKind.EMERGENCY, cycles=None), True),
-        (fault(FaultKind.DUPLICATE, cycles=50), False),
+        (fault(Inside.LOST, cycles=2), False),
+        (fault(Inside.LOST, cycles=6), True),
+        (fault(Inside.EMERGENCY, cycles=None), True),
+        (fault(Inside.DUPLICATE, cycles=50), False),
         (fault(Act.CELL_PAUSE, for_s=0.1), False),
         (fault(Act.CELL_PAUSE, for_s=0.2), True),
         (fault(Act.TWIN), False),
@@ -96,7 +97,7 @@ def test_a_stopped_process_delays_the_stop_of_another_fault_but_not_its_own(othe
 
 
 def test_the_repeated_answers_of_an_axis_are_no_power() -> None:
-    judged = outcome(fault(FaultKind.STALE), 0.03)
+    judged = outcome(fault(Inside.STALE), 0.03)
     judged.frames.append(Frame(STRUCK_NS + 3_000_000_000, TPDO1 + 3, FEEDBACK.pack(8, 0, ENABLED)))
     judge_stop(judged)
     assert judged.violations == []
@@ -104,8 +105,8 @@ def test_the_repeated_answers_of_an_axis_are_no_power() -> None:
 
 
 def test_a_sync_after_the_end_of_the_recorder_makes_no_fault_of_the_cell() -> None:
-    judged = outcome(fault(FaultKind.LOST), 0.01)
-    assert judged.kinds == {FaultKind.LOST}
+    judged = outcome(fault(Inside.LOST), 0.01)
+    assert judged.kinds == {Inside.LOST}
     judged.ended_ns = STRUCK_NS
     assert judged.kinds == set()
 
@@ -123,7 +124,7 @@ LEFT = "settings of J1 (node 1) not restored; switch these drives off"
 GAVE_UP = "settings not restored (asked a second time): J1: TPDO1, 1016h; J2: 1017h; switch these drives off"
 
 
-def changed(kind: Act | FaultKind = Act.EMCY, **fields: object) -> Callable[[], Round]:
+def changed(kind: Act | Inside = Act.EMCY, **fields: object) -> Callable[[], Round]:
     def make() -> Round:
         made = outcome(fault(kind), 0.01)
         for name, value in fields.items():
@@ -149,7 +150,7 @@ def changed(kind: Act | FaultKind = Act.EMCY, **fields: object) -> Callable[[], 
         (changed(Act.NMT, unrestored=[1]), ""),
         (changed(unrestored=[1], said=LEFT), "(d) nodes [1] were left"),
         (changed(Act.LINK_DOWN, unrestored=[1], said=LEFT), ""),
-        (changed(FaultKind.SILENT, unrestored=[1, 2], said=GAVE_UP), ""),
+        (changed(Inside.SILENT, unrestored=[1, 2], said=GAVE_UP), ""),
         (changed(Act.LINK_DOWN, unrestored=[1, 3], said=GAVE_UP), "(d) nodes [3] have other settings"),
         (changed(Act.DISK_FULL, code=1), ""),
         (changed(silent=[1]), "(d) nodes [1] do not answer"),
@@ -159,11 +160,13 @@ def changed(kind: Act | FaultKind = Act.EMCY, **fields: object) -> Callable[[], 
 def test_each_condition_on_the_end_is_judged(made: Callable[[], Round], expected: str) -> None:
     judged = made()
     judge_end(judged)
+    judge_code(judged)
     assert [line[: len(expected)] for line in judged.violations] == ([expected] if expected else [])
 
 
 def test_a_fault_that_came_after_the_end_excuses_nothing() -> None:
     judged = Round((fault(Act.RECORDER_KILL),), code=-9, frames=[Frame(1, SYNC, b"")])
     judge_end(judged)
+    judge_code(judged)
     assert judged.injected == []
     assert [line[:16] for line in judged.violations] == ["(e) exit code -9"]

@@ -28,16 +28,16 @@ POSITION_CUTOFF, DECIMATION_CUTOFF = 0.2, 0.1
 """Fraction of the sampling rate."""
 
 
-def write_cell(folder: Path, period_us: int, pacing: str) -> Path:
-    """A folder with the demo cell's file, its bus vcan0, and a copy of its controller's file."""
+ON_THE_KERNEL = f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrate_bit_s: 1000000\n"
+
+
+def write_cell(folder: Path, period_us: int, pacing: str, bus: str = ON_THE_KERNEL) -> Path:
+    """A folder with the demo cell's file, its bus vcan0 or another one, and a copy of its controller's file."""
     shutil.copy(CONFIGURATIONS / "controllers" / "demo.yaml", folder / "controller.yaml")
     text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
     text = text.replace("../robots", str(CONFIGURATIONS / "robots"))
     text = text.replace("../controllers/demo.yaml", "controller.yaml")
-    bus = (
-        f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrate_bit_s: 1000000\n"
-        f"sync:\n  period_us: {period_us}\n  pacing: {pacing}\n"
-    )
+    bus += f"sync:\n  period_us: {period_us}\n  pacing: {pacing}\n"
     # There is nothing above half the rate, and the filters need room below that.
     rate_hz = 1e6 / period_us
     text = text.replace("position_cutoff_hz: 40.0", f"position_cutoff_hz: {POSITION_CUTOFF * rate_hz}")

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.vcan.judgement import SAME_SYNC_NS, compare, read_recorded
+from tests.vcan.judgement import SAME_SYNC_NS, compare
 from tests.vcan.listener import heard, listening
+from tests.vcan.log_reader import read_recorded
 from tests.vcan.run import INTERFACE
 
 SECOND_BUS_NS = 10_000_000

@@ -1,22 +1,21 @@
 """Compare a log with what a listener heard on the bus: no value that was not there, no loss that is not counted.
 
-It reads logs with `daq.log.reader`, and knows of the stream only what a log promises: a sample belongs to one SYNC, its
-values are those of the TPDOs between this SYNC and the next, and `missing` marks the axes without an answer.
+It shares no code with the product (log_reader.py), and knows of the stream only what a log promises: a sample belongs
+to one SYNC, its values are those of the TPDOs between this SYNC and the next, and `missing` marks the axes without an
+answer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.log.container import UNFINISHED
-from daq.log.reader import LogReader, SampleBlock
 from tests.vcan.listener import Frame
+from tests.vcan.log_reader import Recorded
 
 SYNC, TPDO1 = 0x080, 0x180
 FEEDBACK = Struct("<ihH")
@@ -28,23 +27,13 @@ EARLIEST_S, LATEST_S = 0.1, 3.0
 SAME_SYNC_NS = 1_000_000
 """The recorder converts the kernel's stamps to another clock, to some tens of microseconds."""
 EQUALLY_GOOD_NS = 50_000
+TWICE = "answers twice"
+"""In the reason of a log that no fit accepts, because more answers came than SYNCs were sent.
 
-
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """Samples of a log as arrays, as in `daq.log.reader.SampleBlock`.
-
-    Attributes:
-        started_ns: wall time of the start of the run [ns since 1970].
-        valid: the recorder's verdict; None where it did not come to one.
-    """
-
-    cycle: NDArray[np.int64]
-    time_ns: NDArray[np.int64]
-    values: NDArray[np.int64]  #: position, current, statusword of each axis, shape (k, n, 3)
-    missing: NDArray[np.int64]
-    started_ns: int
-    valid: bool | None
+A recorder whose own SYNC does not come back to it cannot see an answer that the bus carried before that SYNC, and that
+came in after it. If all answers of some cycles were late, their values are one cycle off, and the surplus answer at the
+end shows it (`drivers.stream.answers`). A log without a verdict has not come to that end.
+"""
 
 
 @dataclass
@@ -54,25 +43,13 @@ class Comparison:
     samples: int = 0
     values: int = 0  #: that are bit for bit those of a frame
     flagged: int = 0  #: values that are marked as missing
+    neighbours: int = 0  #: values of the cycle before or after, in a log that is refused for that
     violations: list[str] = field(default_factory=list)
 
-
-def read_recorded(path: Path) -> Recorded | None:
-    """Return the samples of a finished or unfinished log; None for one without samples."""
-    reader = LogReader(path)
-    unfinished = path.name.endswith(UNFINISHED)
-    blocks: list[SampleBlock] = list(reader.until_damage() if unfinished else reader)
-    if not blocks:
-        return None
-    columns = ("position_counts", "current_raw", "statusword")
-    return Recorded(
-        np.concatenate([block.cycle for block in blocks]).astype(np.int64),
-        np.concatenate([block.time_ns for block in blocks]),
-        np.concatenate([np.stack([getattr(block, name).astype(np.int64) for name in columns], 2) for block in blocks]),
-        np.concatenate([block.missing for block in blocks]).astype(np.int64),
-        reader.head.run.started_wall_ns,
-        reader.statistics.valid if reader.concluded else None,
-    )
+    @property
+    def badness(self) -> tuple[int, int]:
+        """The smaller it is, the better does an alignment explain the log."""
+        return len(self.violations), self.neighbours
 
 
 def compare(
@@ -81,6 +58,8 @@ def compare(
     nodes: Mapping[int, int] = DEMO,
     foreign_syncs: Collection[int] = (),
     same_sync_ns: int = SAME_SYNC_NS,
+    in_order: bool = False,
+    clock_steps_ns: Collection[int] = (0,),
 ) -> Comparison:
     """Compare a log with the frames on a bus, for the axes whose nodes are on this bus.
 
@@ -90,30 +69,93 @@ def compare(
         nodes: node id by axis.
         foreign_syncs: places in `frames` of SYNCs of another device, which need no sample.
         same_sync_ns: largest difference between the times of a sample and of its SYNC; on a second bus SYNC is later.
+        in_order: the stamps of the bus are not punctual, but no SYNC is lost: samples and SYNCs are paired by their
+            order, and by their times only if they do not agree so.
+        clock_steps_ns: by how much the recorder's wall clock may have been off at its start.
     """
     syncs = [place for place, frame in enumerate(frames) if frame.identifier == SYNC]
     best: Comparison | None = None
     times_ns = np.array([frames[place].time_ns for place in syncs], dtype=np.int64)
-    for own in _alignments(log, times_ns, same_sync_ns):
-        found = _compare(log, frames, nodes, syncs, own, set(foreign_syncs))
-        if best is None or len(found.violations) < len(best.violations):
+    foreign = set(foreign_syncs)
+    for own in _all_alignments(log, frames, nodes, syncs, times_ns, foreign, same_sync_ns, in_order, clock_steps_ns):
+        found = _compare(log, frames, nodes, syncs, own, foreign, in_order)
+        if best is None or found.badness < best.badness:
             best = found
+        if best.badness == (0, 0):
+            return best
     if best is None:
         best = Comparison(len(log.cycle), violations=["no SYNC on the bus near the start of the run"])
     return best
 
 
-def _alignments(log: Recorded, sync_ns: NDArray[np.int64], same_sync_ns: int) -> list[list[int]]:
+def _all_alignments(
+    log: Recorded,
+    frames: Sequence[Frame],
+    nodes: Mapping[int, int],
+    syncs: Sequence[int],
+    times_ns: NDArray[np.int64],
+    foreign: set[int],
+    same_sync_ns: int,
+    in_order: bool,
+    clock_steps_ns: Collection[int],
+) -> Iterator[list[int]]:
+    for step_ns in clock_steps_ns:
+        started_ns = log.started_ns - step_ns
+        if in_order:
+            yield from _in_order(log, frames, nodes, syncs, _first_syncs(times_ns, started_ns), foreign)
+        yield from _alignments(log, times_ns, started_ns, same_sync_ns)
+
+
+def _first_syncs(sync_ns: NDArray[np.int64], started_ns: int) -> range:
+    """Return the SYNCs near the start of a run, one of which is the log's first."""
+    begin = np.searchsorted(sync_ns, started_ns - round(EARLIEST_S * 1e9))
+    end = np.searchsorted(sync_ns, started_ns + round(LATEST_S * 1e9))
+    return range(int(begin), int(end))
+
+
+def _in_order(
+    log: Recorded,
+    frames: Sequence[Frame],
+    nodes: Mapping[int, int],
+    syncs: Sequence[int],
+    firsts: Sequence[int],
+    foreign: set[int],
+) -> Iterator[list[int]]:
+    """Yield by sample the SYNC behind which its values are: the next one, or one after SYNCs of another device."""
+    ends = [*syncs[1:], len(frames)]
+    windows = [_answers(frames[begin + 1 : end], set(nodes.values())) for begin, end in zip(syncs, ends, strict=True)]
+    for first in firsts:
+        if not _agrees(log, 0, nodes, windows[first]):
+            continue
+        own = [first]
+        for number in range(1, len(log.cycle)):
+            place = own[-1] + 1
+            while place < len(syncs) and syncs[place] in foreign and not _agrees(log, number, nodes, windows[place]):
+                place += 1
+            if place >= len(syncs):
+                break
+            own.append(place)
+        yield own + [-1] * (len(log.cycle) - len(own))
+
+
+def _agrees(log: Recorded, number: int, nodes: Mapping[int, int], window: Mapping[int, Sequence[bytes]]) -> bool:
+    """Return whether the values of a sample are among the answers to a SYNC."""
+    for axis, node in nodes.items():
+        values = tuple(int(value) for value in log.values[number, axis])
+        if not log.missing[number] >> axis & 1 and FEEDBACK.pack(*values) not in window.get(node, ()):
+            return False
+    return True
+
+
+def _alignments(log: Recorded, sync_ns: NDArray[np.int64], started_ns: int, same_sync_ns: int) -> list[list[int]]:
     """Return by sample the SYNC of its time (-1: none), for each first SYNC that fits the time stamps best.
 
     A log counts its time from its first SYNC, whose own time it does not have. No two SYNCs have equal jitter behind
     them: the steps between the samples show which SYNC was first, unless there are very few.
     """
     since_ns = log.time_ns - log.time_ns[0]
-    begin = np.searchsorted(sync_ns, log.started_ns - round(EARLIEST_S * 1e9))
-    end = np.searchsorted(sync_ns, log.started_ns + round(LATEST_S * 1e9))
     tried = []
-    for first in range(int(begin), int(end)):
+    for first in _first_syncs(sync_ns, started_ns):
         wanted = sync_ns[first] + since_ns
         above = np.clip(np.searchsorted(sync_ns, wanted), 1, max(1, len(sync_ns) - 1))
         above = np.minimum(above, len(sync_ns) - 1)
@@ -133,9 +175,11 @@ def _compare(
     syncs: Sequence[int],
     own: Sequence[int],
     foreign: set[int],
+    in_order: bool,
 ) -> Comparison:
     found = Comparison(len(log.cycle))
     say = found.violations.append
+    doubtful = in_order and (log.valid is None or TWICE in log.reason)
     for number, place in enumerate(own):
         name = f"cycle {log.cycle[number]}"
         if place < 0 or (number and place <= own[number - 1]):
@@ -150,8 +194,13 @@ def _compare(
             say(f"{name}: a gap after it in a valid log")
         end = syncs[following] if following < len(syncs) else len(frames)
         window = _answers(frames[syncs[place] + 1 : end], set(nodes.values()))
+        near: dict[int, list[bytes]] = {}
+        if doubtful:
+            begin = syncs[max(0, place - 1)]
+            after = syncs[following + 1] if following + 1 < len(syncs) else len(frames)
+            near = _answers(frames[begin:after], set(nodes.values()))
         for axis, node in nodes.items():
-            _compare_axis(log, found, number, axis, window.get(node, []))
+            _compare_axis(log, found, number, axis, window.get(node, []), near.get(node, []))
     return found
 
 
@@ -164,7 +213,9 @@ def _answers(frames: Sequence[Frame], nodes: set[int]) -> dict[int, list[bytes]]
     return window
 
 
-def _compare_axis(log: Recorded, found: Comparison, number: int, axis: int, window: Sequence[bytes]) -> None:
+def _compare_axis(
+    log: Recorded, found: Comparison, number: int, axis: int, window: Sequence[bytes], near: Sequence[bytes]
+) -> None:
     name = f"cycle {log.cycle[number]}, axis {axis + 1}"
     values = tuple(int(value) for value in log.values[number, axis])
     answers = {FEEDBACK.unpack(data) for data in window if len(data) == FEEDBACK.size}
@@ -175,7 +226,9 @@ def _compare_axis(log: Recorded, found: Comparison, number: int, axis: int, wind
         if number and values != tuple(int(value) for value in log.values[number - 1, axis]):
             found.violations.append(f"{name}: {values} is marked missing and does not repeat the value before")
         return
-    if not answers:
+    if values not in answers and FEEDBACK.pack(*values) in near:
+        found.neighbours += 1
+    elif not answers:
         found.violations.append(f"{name}: no answer on the bus, and it is not marked missing")
     elif values not in answers:
         found.violations.append(f"{name}: {values} was not on the bus; there was {sorted(answers)}")

@@ -15,6 +15,7 @@ from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Axis
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
+from tests.chaos.ends import ChaosBus
 from tests.chaos.processes import Objects
 from tests.drivers.foreign import MAKES, MOVE, ForeignNode, shipped
 from tests.drivers.scripted import PERIOD_NS, permission
@@ -33,7 +34,7 @@ def test_a_drive_of_this_data_sheet_is_found_set_up_moved_and_restored(
     axes = tuple(Axis(f"J{node}", node, shipped(profile)) for node in NODES)
     address = BusAddress("socketcan", INTERFACE)
     with devices(lambda _: [ForeignNode(node, sheet) for node in NODES]):
-        objects = Objects()
+        objects = Objects(ChaosBus())
         try:
             before = [objects.settings(node) for node in NODES]
             begun_s = time.monotonic()

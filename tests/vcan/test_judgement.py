@@ -9,8 +9,9 @@ from random import Random
 import numpy as np
 import pytest
 
-from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1, Recorded, compare
+from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1, compare
 from tests.vcan.listener import Frame
+from tests.vcan.log_reader import Recorded
 
 CYCLES, AXES, PERIOD_NS = 40, 2, 20_000_000
 NODES = {0: 1, 1: 2}

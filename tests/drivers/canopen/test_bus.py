@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from queue import Queue, SimpleQueue
 from typing import cast
 
 import can
 import pytest
 from can.interfaces.socketcand import SocketCanDaemonBus
+from can.interfaces.virtual import VirtualBus
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -21,6 +23,8 @@ from drivers.errors import BusError
 from drivers.simulation.hub import HOST, Hub
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends, same
 from tests.drivers.scripted import FakeClock
+
+LONG_S = 2.0  #: A step of the clock, and so the wait that it led to
 
 
 def three_ends(address: BusAddress) -> Iterator[Ends]:
@@ -36,6 +40,39 @@ class TestVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
         yield from three_ends(BusAddress("virtual", request.node.nodeid))
+
+
+@contextmanager
+def _own(_monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
+    with open_bus(BusAddress("virtual", "clock set back")) as end:
+        yield end
+
+
+@contextmanager
+def _of_a_hub(_monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
+    with Hub(("can0",)) as hub, open_bus(hub.address()) as end:
+        yield end
+
+
+@contextmanager
+def _foreign(monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
+    """An interface of python-can that drivegain has no class for."""
+    monkeypatch.setattr(can, "Bus", lambda **_: VirtualBus("clock set back, foreign"))
+    with open_bus(BusAddress("pcan", "PCAN_USBBUS1")) as end:
+        yield end
+
+
+@pytest.mark.parametrize("opened", [_own, _of_a_hub, _foreign])
+def test_a_wait_does_not_become_longer_when_the_wall_clock_is_set_back(
+    monkeypatch: pytest.MonkeyPatch, opened: Callable[[pytest.MonkeyPatch], AbstractContextManager[can.BusABC]]
+) -> None:
+    """python-can waits by the wall clock: SYNC was not sent until the next frame came."""
+    with opened(monkeypatch) as end:
+        true_s = iter([time.monotonic()])
+        monkeypatch.setattr("can.bus.time", lambda: next(true_s, time.monotonic() - LONG_S))
+        begun_s = time.monotonic()
+        assert end.recv(timeout=0.05) is None
+        assert 0.05 <= time.monotonic() - begun_s < LONG_S / 2
 
 
 class _Flood(SimpleQueue[can.Message]):
