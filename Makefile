@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub
+.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -42,6 +42,7 @@ help:
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make kill-study  jobs killed at 60 random moments, each finished by the next one; some minutes"
 	@echo "make session-kill-study  guided sessions killed at 40 random moments of all stages, each finished by the same command; resumable, some minutes"
+	@echo "make write-fault-study  kills and failures at every changing system call of apply and rollback (docs/evidence/write-path.md); resumable, a quarter of an hour"
 	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
@@ -258,6 +259,9 @@ kill-study: setup
 
 session-kill-study: setup
 	$(BIN)/python -m tests.studies.session_kills
+
+write-fault-study: setup
+	$(BIN)/python -m tests.studies.write_faults --tables docs/evidence/data
 
 guard-study: setup
 	$(BIN)/python -m tests.faults.test_killed

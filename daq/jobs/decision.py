@@ -105,7 +105,7 @@ def _written(context: SessionContext, session: Session, proposal: Proposal[Any],
         subject = proposal.edit.subject
         context.journal.say(Level.NOTICE, "written to the controller's file", file=subject, backup=str(written.backup))
         if written.not_in_history:
-            words = "the history does not have this write; the next job, apply or history --add enters it"
+            words = "the history may lack this write; the next job, apply or history --add enters it"
             context.journal.say(Level.WARNING, words, text=written.not_in_history)
     return session.update(outcome=Outcome.APPLIED)
 

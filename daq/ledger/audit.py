@@ -307,7 +307,8 @@ def _locked(path: Path) -> Iterator[int]:
             )
         yield descriptor
     finally:
-        os.close(descriptor)
+        with contextlib.suppress(OSError):  # the entry was flushed; the descriptor is closed all the same (close(2))
+            os.close(descriptor)
 
 
 def _content_of(path: Path) -> bytes:

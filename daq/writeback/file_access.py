@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
+from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed, reason_of
 from daq.files import follow_links, hold_lock, open_folder, replace_file
 from daq.formats.document import read_controller_file
 from daq.writeback.request import short_digest
@@ -103,7 +103,13 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 remedy="wait until it has finished, then take a new dry run",
             ) from error
         except OSError as error:
-            raise OutputFailed.of(lock, error) from error
+            # Not "it is as it was": an empty lock file may stay behind where the disk refuses to remove it.
+            raise OutputFailed(
+                str(lock),
+                found=reason_of(error),
+                expected="a lock file beside the controller's file",
+                remedy="nothing was written to the controller; free space or rights",
+            ) from error
         yield
 
 

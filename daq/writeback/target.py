@@ -288,7 +288,7 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
             recorder.begin(AuditAction.WRITE_FOUND, details)
     except Exception as error:  # noqa: BLE001 - the target has these gains: no error of the history may call that undone
         _LOG.warning(
-            "the history does not have this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
+            "the history may lack this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
             evidence(error),
         )
         return evidence(error)
@@ -338,8 +338,9 @@ class _Recorder:
         try:
             return self.begin(action, details)
         except (OutputFailed, AuditUnusable) as error:
-            # The write is done, and the first entry has its digests: no reason to call it undone.
-            _LOG.warning("the audit log does not have that it is %s: %s", action.value, evidence(error))
+            # The write is done, and the first entry has its digests: no reason to call it undone. The line may be
+            # there all the same: a flush that failed says nothing about what the disk has.
+            _LOG.warning("the audit log may lack the entry that it is %s: %s", action.value, evidence(error))
             return None
 
     @contextlib.contextmanager

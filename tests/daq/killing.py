@@ -7,13 +7,15 @@ import os
 import signal
 import warnings
 from collections.abc import Callable
+from typing import NoReturn
 
 import pytest
 
 _TRACEME, _SYSCALL, _SETOPTIONS = 0, 24, 0x4200
 _TRACESYSGOOD, _EXITKILL = 0x1, 0x100000
 _SYSCALL_STOP = signal.SIGTRAP | 0x80
-_FAILED, _NOT_PERMITTED = 70, 77
+_FAILED = 70
+NOT_PERMITTED = 77  #: Exit code of a child that may not be traced
 
 _ptrace = ctypes.CDLL(None, use_errno=True).ptrace
 _ptrace.argtypes = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p)
@@ -47,19 +49,19 @@ def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> b
     """
     child = os.fork()
     if child == 0:
-        _be_traced(work)
+        be_traced(work)
     _, status = os.waitpid(child, 0)
-    if os.WIFEXITED(status) and os.WEXITSTATUS(status) == _NOT_PERMITTED:
+    if os.WIFEXITED(status) and os.WEXITSTATUS(status) == NOT_PERMITTED:
         reason = "ptrace is not permitted here: no process can be killed at a chosen system call"
         # In CI a skip goes unread, so this test must not be skipped: it alone shows that no kill leaves half a file.
         if os.environ.get("CI"):
             pytest.fail(reason)
         pytest.skip(reason)
     try:
-        _ask(_SETOPTIONS, child, _TRACESYSGOOD | _EXITKILL)
+        ask_ptrace(_SETOPTIONS, child, _TRACESYSGOOD | _EXITKILL)
         stops = 0
         while True:
-            _ask(_SYSCALL, child, 0)
+            ask_ptrace(_SYSCALL, child, 0)
             _, status = os.waitpid(child, 0)
             if not os.WIFSTOPPED(status):
                 assert os.WIFEXITED(status)
@@ -75,18 +77,25 @@ def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> b
             os.waitpid(child, 0)
 
 
-def _be_traced(work: Callable[[], object]) -> None:
+def be_traced(work: Callable[[], object]) -> NoReturn:
+    """Do some work in a child that was just forked, once its parent traces it; an integer is its exit code."""
     code = _FAILED
     try:
         if _ptrace(_TRACEME, 0, None, None) != 0:
-            os._exit(_NOT_PERMITTED)
+            os._exit(NOT_PERMITTED)
         os.kill(os.getpid(), signal.SIGSTOP)
-        work()
-        code = 0
+        found = work()
+        code = found if isinstance(found, int) else 0
     finally:
         os._exit(code)
 
 
-def _ask(request: int, child: int, data: int) -> None:
+def ask_ptrace(request: int, child: int, data: int) -> None:
+    """Make a request of ptrace(2).
+
+    Raises:
+        OSError: the kernel refuses it.
+    """
     if _ptrace(request, child, None, data) != 0:
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))

@@ -1,0 +1,158 @@
+"""Failures at system calls of a write, a sample of `tests.studies.write_faults`; and what its checks would notice."""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.daq.failing_calls import Fault, Traced, traced, why_not_here
+from tests.studies.write_faults import ERRORS, CallUnit, FaultRow, Scene, counts
+from tests.studies.write_truth import Content, Facts, false_sentences, wrong_code
+
+CONTROLLER = Path("/cell/x.yaml")
+SAMPLE = ("chmod of lock", "fsync of audit log", "close of audit log", "rename of controller's file", "fsync of folder")
+"""Where a lock file stays behind, where an entry is there that was not flushed, and beside the replacement."""
+
+
+@pytest.fixture(scope="module")
+def small() -> Iterator[Executor]:
+    """A process that has imported this module alone: its forks are quick, and no thread of another test is in it."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+def _require_tracing(small: Executor) -> None:
+    reason = small.submit(why_not_here).result()
+    if reason:
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+def _label(unit: CallUnit) -> str:
+    file = "folder" if unit.file.startswith("folder") else unit.file
+    return f"{unit.call} of {file}"
+
+
+def _sampled(folder: Path) -> list[FaultRow]:
+    """The last call of each kind of the sample: killed there, and failing with one error from there on."""
+    scene = Scene(folder, "apply")
+    last = {_label(unit): unit for unit in scene.units()}
+    rows = []
+    for number, label in enumerate(SAMPLE):
+        unit = last[label]
+        rows.append(scene.run(unit, None))
+        rows.append(scene.run(unit, ERRORS[number % len(ERRORS)], is_lasting=True))
+    return rows
+
+
+def test_sampled_failures_of_a_write_every_sentence_is_true_and_the_next_command_ends_well(
+    tmp_path: Path, small: Executor
+) -> None:
+    _require_tracing(small)
+    rows = small.submit(_sampled, tmp_path.resolve()).result()
+    assert [(row.call, row.file, row.false_sentences, row.bad_states) for row in rows] == [
+        (row.call, row.file, (), ()) for row in rows
+    ]
+    assert {row.content for row in rows} == {"old", "new"}
+    assert [row.code for row in rows].count(-1) == len(SAMPLE)
+    assert sum(count.cases for count in counts(rows)) == len(rows)
+
+
+def _closed_badly(folder: Path) -> FaultRow:
+    """The first entry of the audit log is flushed, and its file cannot be closed."""
+    scene = Scene(folder, "apply")
+    first = next(unit for unit in scene.units() if _label(unit) == "close of audit log")
+    return scene.run(first, errno.EIO)
+
+
+def test_an_entry_that_was_flushed_counts_although_the_audit_log_cannot_be_closed(
+    tmp_path: Path, small: Executor
+) -> None:
+    _require_tracing(small)
+    row = small.submit(_closed_badly, tmp_path.resolve()).result()
+    assert (row.code, row.content) == (0, "new")
+    assert row.false_sentences == row.bad_states == ()
+
+
+def _append_twice(path: Path) -> int:
+    """Return 0 where both lines were written, 1 where the first one failed, 2 where the second one did."""
+    for number in (1, 2):
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            try:
+                os.write(descriptor, b"line\n")
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            return number if error.errno == errno.EDQUOT else 9
+    return 0
+
+
+def _traced_twice(path: Path, fault: Fault | None) -> Traced:
+    return traced(lambda: _append_twice(path), path.__eq__, fault)
+
+
+def test_a_fault_is_at_the_chosen_call_and_the_call_is_not_made(tmp_path: Path, small: Executor) -> None:
+    _require_tracing(small)
+    path = tmp_path.resolve() / "file"
+    whole = small.submit(_traced_twice, path, None).result()
+    assert whole.code == 0
+    assert [call.name for call in whole.calls] == ["open", "write", "close"] * 2
+    assert path.read_text() == "line\n" * 2
+    path.unlink()
+    failed = small.submit(_traced_twice, path, Fault(4, errno.EDQUOT)).result()
+    assert failed.code == 2
+    assert path.read_text() == "line\n"
+    path.unlink()
+    killed = small.submit(_traced_twice, path, Fault(1)).result()
+    assert killed.code is None
+    assert path.read_text() == ""
+
+
+def _facts(content: Content, **changed: object) -> Facts:
+    before = {CONTROLLER: b"old"}
+    after = {CONTROLLER: content.value.encode()}
+    return replace(Facts(content, CONTROLLER, before, after, (), has_write=False), **changed)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("said", "true_of"),
+    [
+        ("error: /cell/x.yaml found: no space expected: room do: it is as it was; free space", Content.OLD),
+        ("do: nothing was written to the controller; free space or rights", Content.OLD),
+        ("do: check the disk; /cell/x.yaml has the new content, complete", Content.NEW),
+        ("the audit log may lack the entry that it is applied: a.jsonl: no space", Content.NEW),
+        ("the audit log may lack the entry that it is failed: a.jsonl: no space", Content.OLD),
+    ],
+)
+def test_a_sentence_is_false_of_the_other_content(said: str, true_of: Content) -> None:
+    other = Content.NEW if true_of is Content.OLD else Content.OLD
+    assert false_sentences(said, _facts(true_of)) == ()
+    assert len(false_sentences(said, _facts(other))) == 1
+
+
+def test_a_backup_that_is_named_must_have_the_old_content() -> None:
+    said = "Written to /cell/x.yaml, backup x.yaml.bak; audit log a.jsonl."
+    backup = CONTROLLER.with_name("x.yaml.bak")
+    right = _facts(Content.NEW, after={CONTROLLER: b"new", backup: b"old"})
+    assert false_sentences(said, right) == ()
+    assert false_sentences(said, replace(right, after={backup: b"o"})) != ()
+
+
+def test_a_claim_that_no_rule_judges_is_a_finding() -> None:
+    assert false_sentences("The moon was restored.", _facts(Content.OLD)) != ()
+
+
+def test_an_exit_code_that_denies_or_invents_a_write_is_wrong() -> None:
+    assert wrong_code(0, "", _facts(Content.OLD)) != ""
+    assert wrong_code(1, "", _facts(Content.NEW)) != ""
+    assert wrong_code(1, "x has the new content, complete", _facts(Content.NEW)) == ""
+    assert wrong_code(None, "", _facts(Content.OLD)) == ""

@@ -1,0 +1,125 @@
+"""Whether what a command says of a write is what is on the disk.
+
+Every sentence that claims something about files must be known here: a claim without a rule is a finding too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+
+class Content(Enum):
+    """Content of the controller's file."""
+
+    OLD = "old"
+    NEW = "new"
+    BROKEN = "neither"
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What is on the disk after a command.
+
+    Attributes:
+        content: of the controller's file.
+        controller: its file.
+        before, after: every file of the place by its path, with its content.
+        ended: actions of the writes that the audit log ends, in its order.
+        has_write: the history has the write that the command was asked for.
+    """
+
+    content: Content
+    controller: Path
+    before: dict[Path, bytes]
+    after: dict[Path, bytes]
+    ended: tuple[str, ...]
+    has_write: bool
+
+    def is_as_before(self, path: Path) -> bool:
+        """Whether a file has the content that it had, or is not there as before."""
+        return self.before.get(path) == self.after.get(path)
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A sentence that claims something, and the check of its claim."""
+
+    pattern: str
+    holds: Callable[[re.Match[str], Facts], bool]
+
+
+def _is_old(_: re.Match[str], facts: Facts) -> bool:
+    return facts.content is Content.OLD
+
+
+def _is_new(_: re.Match[str], facts: Facts) -> bool:
+    return facts.content is Content.NEW
+
+
+def _subject_as_before(found: re.Match[str], facts: Facts) -> bool:
+    return facts.is_as_before(Path(found["subject"]))
+
+
+def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
+    backup = facts.controller.parent / found["backup"]
+    return facts.content is Content.NEW and facts.after.get(backup) == facts.before[facts.controller]
+
+
+def _is_any(_: re.Match[str], __: Facts) -> bool:
+    """Hold for a sentence that says itself that it does not know, or that speaks of what a reader may do."""
+    return True
+
+
+RULES = (
+    Rule(r"error: (?P<subject>\S+) found: [^;]*? do: it is as it was", _subject_as_before),
+    Rule(r"nothing was written to the controller", _is_old),
+    Rule(r"nothing was (written|changed|restored)", _is_old),
+    Rule(r"Nothing to write: the controller file has these gains already", _is_new),
+    Rule(r"has the new content, complete", _is_new),
+    Rule(r"the history lacks this write", lambda _, facts: not facts.has_write),
+    Rule(r"the history may lack this write", _is_any),
+    Rule(r"the audit log may lack the entry that it is (applied|rolled back)", _is_new),
+    Rule(r"the audit log may lack the entry that it is (failed|refused)", _is_old),
+    Rule(r"Written to \S+, backup (?P<backup>\S+); audit log", _written_with_backup),
+    Rule(r"Restored \S+ to \S+; the replaced content is in (?P<backup>\S+?)\.(\s|$)", _written_with_backup),
+    Rule(r"was written before that, completely", _is_new),
+    Rule(r"whether \S+ has the new content is not known", _is_any),
+    Rule(r"a file system that completes what it began", _is_any),
+    Rule(r"a folder that can be written", _is_any),
+    Rule(r"`drivegain rollback \S+` undoes it", _is_any),
+)
+CLAIMS = re.compile(
+    r"\b(written|unchanged|as it was|as before|restored|rolled back|kept|complete|completely|lacks|does not have|not "
+    r"known|was changed|undone|lost|saved|replaced)\b",
+    re.IGNORECASE,
+)
+"""Words of a sentence that claims something about files."""
+
+
+def false_sentences(said: str, facts: Facts) -> tuple[str, ...]:
+    """Return the sentences that are not true, and those that claim something that no rule judges."""
+    text = " ".join(said.split())
+    found = []
+    for rule in RULES:
+        matches = re.finditer(rule.pattern, text)
+        found += [f"false: {match[0]}" for match in matches if not rule.holds(match, facts)]
+        text = re.sub(rule.pattern, " … ", text)
+    for claim in CLAIMS.finditer(text):
+        around = text[max(0, claim.start() - 60) : claim.end() + 40]
+        found.append(f"not judged: {around}")
+    return tuple(found)
+
+
+def wrong_code(code: int | None, said: str, facts: Facts) -> str:
+    """Return what is wrong with an exit code; empty where it is right. A killed process has none."""
+    if code is None:
+        return ""
+    if code == 0 and facts.content is not Content.NEW:
+        return "exit 0 and the old file"
+    if code != 0 and facts.content is Content.NEW and "has the new content" not in said:
+        return f"exit {code}, the new file, and no word of it"
+    return ""
