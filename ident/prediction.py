@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
@@ -16,13 +16,20 @@ from ident.effects.own import known_effect, known_names
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectNotInstalled, EffectRefused, ModelError
-from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.bodies import LINK_PARAMETERS, LOADED, Payload
 from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
 
+STATES = 200  #: Random states that show which parameters of a serial robot move its joints
+UNSEEN = 1e-9  #: Share of the largest singular value that is rounding
+SAME_GROUPING = (
+    0.02  #: Share by which a grouping may differ: a corrected zero or length of millimetres is the same robot
+)
+SHOWN_PARAMETERS = 4  #: Of another robot, in a message
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 
+@takes(calibration=Calibration, model=Model, data=Dataset)
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
 
@@ -104,6 +111,7 @@ def _bounded(torque: FloatArray, accepted: AcceptedEffect) -> FloatArray:
     return np.clip(torque, -limit, limit)
 
 
+@takes(calibration=Calibration, model=Model, data=Dataset)
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the current references of a motion, v = (T τ)/g.
 
@@ -116,6 +124,7 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
+@takes(calibration=Calibration, model=Model, motion=Motion | None)
 def measured_torque(
     calibration: Calibration, model: Model, current_a: ArrayLike, motion: Motion | None = None
 ) -> FloatArray:
@@ -131,7 +140,12 @@ def measured_torque(
     Raises:
         ModelError: the calibration has another number of gains, or the loops cannot be closed.
     """
-    torque = np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
+    gains = _gains(calibration, model)
+    current = as_array("current_a", current_a)
+    if current.ndim != 2 or current.shape[1] != len(gains):
+        expected = f"(n_samples, {len(gains)}), one column per motor"
+        raise ModelError(f"current_a has shape {current.shape}; expected {expected}; transpose it?")
+    torque = np.asarray((gains * current) @ model.drive_train.direction)
     if motion is None or not model.is_redundant:
         return torque
     return without_preload(model.follow(motion), torque.T).T
@@ -156,8 +170,9 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     What a payload adds to friction is left out where the model has no friction by payload.
 
     Raises:
-        ModelError: a parameter is none of this robot's.
+        ModelError: a parameter is none of this robot's, or groups with others as it does in no robot like this one.
     """
+    _require_same_robot(calibration, model)
     index = {column.name: number for number, column in enumerate(model.columns)}
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     standard = np.zeros(len(index))
@@ -174,6 +189,68 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
             )
         standard[index[leading]] = parameter.value
     return standard
+
+
+def _require_same_robot(calibration: Calibration, model: Model) -> None:
+    """Refuse a calibration whose base parameters are not those of the model.
+
+    A vector n of standard parameters that moves no joint of the model, W n = 0, has base parameters of zero: K n = 0
+    with the grouping K that the names of the identified set give, whatever its motions were. Lengths of links are in
+    K: those of another robot leave something. Closed chains are told apart by their columns alone.
+
+    Raises:
+        ModelError: the two robots are not the same.
+    """
+    _gains(calibration, model)
+    if model.robot.closures:
+        return
+    index = {column.name: number for number, column in enumerate(model.columns)}
+    null = _unseen_directions(model)
+    differing: list[str] = []
+    for parameter in calibration.parameters:
+        weights = _grouping(parameter.name, index)
+        if weights is None:
+            continue
+        left = float(np.abs(weights @ null).max(initial=0.0))
+        if left > SAME_GROUPING * float(np.abs(weights).max()):
+            differing.append(parameter.name)
+    if not differing:
+        return
+    shown = "; ".join(differing[:SHOWN_PARAMETERS])
+    raise ModelError(
+        f"the calibration of cell {calibration.cell!r} has base parameters that the model does not have: {shown}"
+        f"{' and others' if len(differing) > SHOWN_PARAMETERS else ''}; expected the model that it was fitted with: "
+        "the lengths and axes of the robot differ; give its own URDF and closures"
+    )
+
+
+def _grouping(name: str, index: dict[str, int]) -> FloatArray | None:
+    """Weights of the standard parameters in a base parameter's name, shape (c,): `Ixx2 - 1.0*Iyy2 + 0.5*m3`.
+
+    None of another name: of a payload, of an effect, or of friction with a payload.
+    """
+    leading, *terms = name.split()
+    if leading not in index or ":" in name or LOADED in name:
+        return None
+    weights = np.zeros(len(index))
+    weights[index[leading]] = 1.0
+    for sign, term in zip(terms[::2], terms[1::2], strict=False):
+        factor, _, column = term.partition("*")
+        if column not in index:
+            return None
+        weights[index[column]] = float(f"{sign}{factor}")
+    return weights
+
+
+def _unseen_directions(model: Model) -> FloatArray:
+    """Directions of the standard parameters that no motion of a serial robot shows, shape (c, d), unit columns."""
+    rng = np.random.default_rng(0)
+    shape = (STATES, model.robot.axis_count)
+    states = [rng.uniform(-3.0, 3.0, shape) for _ in range(3)]
+    columns = model.regressor(Motion(*states))
+    rows = columns.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(directions[sizes < UNSEEN * sizes[0]].T)
 
 
 def mounted_parameters(calibration: Calibration, mounting: str) -> dict[str, Parameter]:

@@ -31,7 +31,7 @@ class JointLimits:
 
     def __post_init__(self) -> None:
         for name in ("lower", "upper", "velocity", "acceleration"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+            object.__setattr__(self, name, as_array(f"limits.{name}", getattr(self, name)))
 
     def targets(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and the largest targets of a plan, which keep a margin from the limits."""
