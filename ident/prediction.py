@@ -20,7 +20,7 @@ from ident.model.bodies import LINK_PARAMETERS, LOADED, Payload
 from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
 
-STATES = 200  #: Random states that show which parameters of a serial robot move its joints
+STATES = 60  #: Random states that show which parameters of a serial robot move its joints
 UNSEEN = 1e-9  #: Share of the largest singular value that is rounding
 SAME_GROUPING = (
     0.02  #: Share by which a grouping may differ: a corrected zero or length of millimetres is the same robot
