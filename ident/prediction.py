@@ -202,7 +202,9 @@ def _require_same_robot(calibration: Calibration, model: Model) -> None:
         ModelError: the two robots are not the same.
     """
     _gains(calibration, model)
-    if model.robot.closures:
+    # Standard parameters that were put in as they are, none grouped with others, are right for their robot.
+    is_grouped = any(" " in parameter.name and ":" not in parameter.name for parameter in calibration.parameters)
+    if model.robot.closures or not is_grouped:
         return
     index = {column.name: number for number, column in enumerate(model.columns)}
     null = _unseen_directions(model)
