@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array
+from ident.arrays import FloatArray, as_array, require_kind, require_names
 from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
@@ -345,7 +345,14 @@ def calibration_of(
     """
     # Reading a calibration needs no effects and no estimator.
     from ident.effects.signals import session_began_s  # noqa: PLC0415
+    from ident.estimators.estimate import Identification as IdentificationKind  # noqa: PLC0415
     from ident.estimators.payload_mass import mass_responses  # noqa: PLC0415
+
+    require_kind("found", found, IdentificationKind, "give the result of ident.identify")
+    require_names("axes", axes)
+    require_names("units", units)
+    require_kind("robot", robot, str, "give the name of the robot or cell")
+    require_kind("steps", steps, Sequence, "give the result of ident.find_effects")
 
     last = steps[-1].after if steps else None
     start, found = found, found if last is None else last.identification
@@ -354,6 +361,11 @@ def calibration_of(
         raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
     nameplate_gains = np.atleast_1d(as_array("nameplate", nameplate))
+    if nameplate_gains.ndim != 1 or not nameplate_gains.all():
+        raise ModelError(
+            f"nameplate is {nameplate_gains.tolist()}; expected one gain per axis, none of them zero: take them from "
+            "the data sheet, or the identified ones"
+        )
     units = units or ("Nm/A",) * len(axes)
     if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
@@ -367,6 +379,9 @@ def calibration_of(
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate_gains, strict=True)
     gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
     responses = mass_responses(found.system, estimate)
+    tolerance_kg: dict[str, float] = {}
+    for payload in found.system.payloads:
+        tolerance_kg[payload.name] = max(payload.mass_tolerance_kg, tolerance_kg.get(payload.name, 0.0))
     undriven = found.model.robot.undriven_names
     places = (*axes, *undriven)
     return Calibration(
@@ -393,7 +408,9 @@ def calibration_of(
         passive_joints=undriven,
         own_effects=() if last is None else _own_effects(last),
         payload_mass=tuple(
-            PayloadMass.of(one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist())
+            PayloadMass.of(
+                one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist()
+            ).weighed_to(tolerance_kg[one.payload])
             for one in responses
         ),
     )

@@ -37,7 +37,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import gammaincinv
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, require_number, takes
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
@@ -129,6 +129,7 @@ class _Residual:
     move: IntArray  #: shape (r,)
 
 
+@takes(calibration=Calibration, model=Model, run=Run, conditioning=Conditioning | None, band=Band | None)
 def external_torque(
     calibration: Calibration,
     model: Model,
@@ -159,6 +160,7 @@ def external_torque(
     return ExternalTorque(rows.time_s, rows.torque_nm, scale, rows.use, band, itself, left_out)
 
 
+@takes(calibration=Calibration, model=Model, quiet=Iterable, conditioning=Conditioning | None)
 def prediction_band(
     calibration: Calibration,
     model: Model,
@@ -178,11 +180,13 @@ def prediction_band(
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
     """
+    alarms_per_hour = require_number("alarms_per_hour", alarms_per_hour, above=0.0, remedy="give a rate such as 1")
     filters = conditioning or calibration.conditioning
     return _band([_residual(calibration, model, run, filters) for run in quiet], alarms_per_hour)
 
 
 def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
+    require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model, data, conditioning)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
@@ -24,6 +25,7 @@ from ident.model.same_robot import foreign_base_parameter
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 
+@takes(calibration=Calibration, model=Model, data=Dataset)
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
 
@@ -105,6 +107,7 @@ def _bounded(torque: FloatArray, accepted: AcceptedEffect) -> FloatArray:
     return np.clip(torque, -limit, limit)
 
 
+@takes(calibration=Calibration, model=Model, data=Dataset)
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the current references of a motion, v = (T τ)/g.
 
@@ -117,6 +120,7 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
+@takes(calibration=Calibration, model=Model, motion=Motion | None)
 def measured_torque(
     calibration: Calibration, model: Model, current_a: ArrayLike, motion: Motion | None = None
 ) -> FloatArray:
@@ -132,7 +136,12 @@ def measured_torque(
     Raises:
         ModelError: the calibration has another number of gains, or the loops cannot be closed.
     """
-    torque = np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
+    gains = _gains(calibration, model)
+    current = as_array("current_a", current_a)
+    if current.ndim != 2 or current.shape[1] != len(gains):
+        expected = f"(n_samples, {len(gains)}), one column per motor"
+        raise ModelError(f"current_a has shape {current.shape}; expected {expected}; transpose it?")
+    torque = np.asarray((gains * current) @ model.drive_train.direction)
     if motion is None or not model.is_redundant:
         return torque
     return without_preload(model.follow(motion), torque.T).T
@@ -157,8 +166,9 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     What a payload adds to friction is left out where the model has no friction by payload.
 
     Raises:
-        ModelError: a parameter is none of this robot's, or gathers others than this robot's geometry does.
+        ModelError: a parameter is none of this robot's, or groups with others as it does in no robot like this one.
     """
+    _gains(calibration, model)  # as many axes
     index = {column.name: number for number, column in enumerate(model.columns)}
     of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
     standard = np.zeros(len(index))
@@ -176,6 +186,16 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
             )
         standard[index[leading]] = parameter.value
         names.append(parameter.name)
+    _require_same_robot(calibration, model, names)
+    return standard
+
+
+def _require_same_robot(calibration: Calibration, model: Model, names: Sequence[str]) -> None:
+    """Refuse base parameters of another geometry (`foreign_base_parameter`).
+
+    Raises:
+        ModelError: the two robots are not the same.
+    """
     foreign = foreign_base_parameter(model, names)
     if foreign is not None:
         raise ModelError(
@@ -183,7 +203,6 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
             "gathers; expected a calibration of the model's robot; give the model (URDF, gravity, drive train) that it "
             "was fitted with"
         )
-    return standard
 
 
 def mounted_parameters(calibration: Calibration, mounting: str) -> dict[str, Parameter]:

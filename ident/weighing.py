@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, takes
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
@@ -187,6 +187,7 @@ def _about_centre(body: FloatArray) -> FloatArray:
     return np.asarray(body[:6] - steiner / body[9])
 
 
+@takes(calibration=Calibration, model=Model, loaded=Iterable, conditioning=Conditioning | None, bare=Iterable)
 def weigh(
     calibration: Calibration,
     model: Model,
@@ -223,7 +224,11 @@ def rows_to_weigh(
     """
 
     def prepared(runs: Iterable[Run]) -> list[Dataset]:
-        return [differentiate(replace(run, payload=None), model.drive_train, conditioning) for run in runs]
+        made: list[Dataset] = []
+        for run in runs:
+            require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+            made.append(differentiate(replace(run, payload=None), model.drive_train, conditioning))
+        return made
 
     without, mounted = prepared(bare), prepared(loaded)
     if not mounted:

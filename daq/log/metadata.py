@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError
 
+from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
 T = TypeVar("T")
@@ -172,7 +173,10 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         known = _validated(dict[str, FiniteFloat], record["payload_known"])
         if not known.keys() <= set(LINK_PARAMETERS) or known.get("m", 1.0) <= 0.0:
             raise ValueError(f"known payload {record['payload_known']!r:.80}: expected parameters with a mass above 0")
-        payload = Payload(record["payload"], record["mounting"], known)
+        try:
+            payload = Payload(record["payload"], record["mounting"], known)
+        except ModelError as error:
+            raise ValueError(str(error)) from error
     rate_hz = float(record["rate_hz"])
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
         raise ValueError(f"sampling rate {record['rate_hz']!r:.40}")

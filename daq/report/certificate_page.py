@@ -27,7 +27,7 @@ from daq.report.html import (
 )
 from daq.report.picture import QUANTITY
 from daq.report.svg import Interval, Line, before_after_drawing, chart, intervals
-from daq.report.text import SHOWN_SIGMAS, percent_text
+from daq.report.text import SHOWN_SIGMAS, minute_text, percent_text
 from daq.writeback.file_target import FileEdit
 from daq.writeback.request import GainChange
 from ident.calibration import AcceptedEffect, Calibration, Source
@@ -418,6 +418,7 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
             f"Estimator {_METHODS.get(calibration.method, calibration.method)}, {calibration.rows} rows, condition "
             f"{calibration.condition:.0f}; on the data of the fit the model leaves {percent_text(fit.total)} %. "
             f"Calibration {certificate.origin.sha256}, configuration "
-            f"{calibration.configuration_sha256 or 'not known'}, made {calibration.created} by {calibration.software}."
+            f"{calibration.configuration_sha256 or 'not known'}, made {minute_text(calibration.created)} by "
+            f"{calibration.software or 'software not known'}."
         ),
     )

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
+from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array, require_number, require_real, takes
 from ident.data.channel_faults import (
     ChannelFault,
     ChannelKind,
@@ -75,6 +75,7 @@ class Dataset:
         return Motion(self.position_rad[part], self.velocity_rad_s[part], self.acceleration_rad_s2[part])
 
 
+@takes(run=Run, drive_train=DriveTrain, conditioning=Conditioning | None)
 def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning | None = None) -> Dataset:
     """Filter the positions without phase, then take central differences (paper §2.3).
 
@@ -98,9 +99,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning 
     current = as_array("current_a", run.current_a, shape, each, refuse)
     usable = None if run.valid is None else as_array("valid", run.valid, shape, each, refuse)
     logged = None if run.move is None else as_array("move", run.move, shape[:1], "one entry per sample", refuse)
-    temperature_c = None if run.temperature_c is None else np.asarray(run.temperature_c, dtype=np.float64)
-    if temperature_c is not None and temperature_c.shape != shape:
-        raise refuse(f"temperature_c has shape {temperature_c.shape}; expected {shape}, {each}")
+    temperature_c = _temperature(run.temperature_c, shape, each, refuse)
     run = replace(run, time_s=time_s)
     _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
@@ -151,6 +150,17 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning 
     )
 
 
+def _temperature(values: object, shape: tuple[int, ...], each: str, refuse: Refusal) -> FloatArray | None:
+    """Temperatures of a run, shape (k, n), NaN where a motor has none; None without any."""
+    if values is None:
+        return None
+    require_real("temperature_c", values, refuse)
+    temperature_c = np.asarray(values, dtype=np.float64)
+    if temperature_c.shape != shape:
+        raise refuse(f"temperature_c has shape {temperature_c.shape}; expected {shape}, {each}")
+    return temperature_c
+
+
 def moving_samples(velocity: FloatArray, speed: FloatArray, drive_train: DriveTrain) -> tuple[BoolArray, BoolArray]:
     """Samples of each joint, and of each motor, that are not at standstill, shape (n, k) each.
 
@@ -191,6 +201,7 @@ def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, condit
     return np.asarray(np.maximum(STANDSTILL_SHARE_OF_SPEED * speed, STANDSTILL_SIGMAS * kept * noise))
 
 
+@takes(motion=Motion, payload=Payload | None)
 def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> Dataset:
     """Make a dataset of a motion that was not recorded, for `ident.prediction`.
 
@@ -201,8 +212,10 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
 
     Raises:
         DataUnfit: the shapes differ, or a number is not finite.
+        ModelError: an argument is of another type, or the rate is not above zero.
     """
     refuse = partial(DataUnfit, "planned motion")
+    rate_hz = require_number("rate_hz", rate_hz, above=0.0, remedy="give the rate of the samples, such as 500")
     labels = "position_rad", "velocity_rad_s", "acceleration_rad_s2"
     position, velocity, acceleration = (as_array(label, getattr(motion, label), refuse=refuse) for label in labels)
     shape = position.shape
@@ -229,10 +242,6 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
 
 def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) -> None:
     samples = len(run.time_s)
-    if run.payload is not None and "m" in run.payload.known:
-        mass_kg = run.payload.known["m"]
-        if not 0.0 < mass_kg < np.inf:  # a negative mass would reverse the sign of every gain
-            raise refuse(f"payload {run.payload.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg")
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
         raise refuse(f"{speeds} standstill speeds for {count} joints; give one a joint")

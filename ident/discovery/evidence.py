@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import Demands, as_demanded, with_demand
@@ -83,6 +83,7 @@ class Evidence:
         return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())
 
 
+@takes(found=Identification, runs=Iterable, holdout=Iterable)
 def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
     """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
     model, conditioning = found.model, found.conditioning

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, takes
 from ident.discovery.balancer import propose_balancers
 from ident.discovery.cables import propose_cables
 from ident.discovery.candidates import ColumnCache, SearchProblem
@@ -96,6 +96,7 @@ class Step:
         return (*best, added)
 
 
+@takes(start=Evidence, rng=np.random.Generator, gates=Gates | None, axes=Sequence, own_effects=Sequence)
 def find_effects(
     start: Evidence,
     rng: np.random.Generator,

@@ -13,13 +13,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray, as_array
+from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_entries, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -36,7 +35,7 @@ from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update, triangle
 from ident.errors import GAIN_UNSEEN, CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
@@ -51,9 +50,6 @@ from ident.estimators.refusals import (
 )
 from ident.model.model import Model
 from ident.plausible import CURRENT_RANGE, GAIN_RANGE, TORQUE_RATIO, WEIGHT_RATIO, range_text
-
-if TYPE_CHECKING:  # which refuses a fit by the same checks
-    from ident.estimators.estimate import Identification
 
 LARGEST_AXIS_ERROR_PERCENT = 20.0  #: Clean recordings stay below 15, with every effect undeclared below 40
 LARGEST_CONDITION = 1e6
@@ -73,6 +69,7 @@ CHANNEL_BLOCKS = 8  #: Blocks of moves of which each shows whether an exchange e
 ALIKE = 0.25  #: Least squared correlation of two torques of which one is the other's, reversed
 
 
+@takes(found=Identification, axes=Sequence)
 def diagnose(
     found: Identification,
     axes: Sequence[str],
@@ -94,6 +91,7 @@ def diagnose(
         PayloadDiffers: see `payload_diagnoses`.
         JointStill: a joint never moves in a run, in place of an error that this explains.
     """
+    require_names("axes", axes, found.model.robot.axis_count)
     entered_gains: FloatArray | None = None
     if nameplate is not None:
         entered_gains = as_array("nameplate", nameplate, (len(axes),), "one per axis")
@@ -406,6 +404,7 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
 # Channels
 
 
+@takes(model=Model, runs=Iterable, conditioning=Conditioning, axes=Sequence)
 def exchanged_channels(
     model: Model, runs: Iterable[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> Diagnosis | None:
@@ -419,6 +418,8 @@ def exchanged_channels(
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
+    require_names("axes", axes, model.robot.axis_count)
+    require_entries("runs", runs, Run, "give a list of runs: [bare, loaded]")
     if model.is_redundant:  # internal preload is in every current: no motor has an equation without those of the others
         return None
     return exchange_shown_by(channel_evidence(model, runs, conditioning), axes)

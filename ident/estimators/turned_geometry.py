@@ -36,7 +36,7 @@ import numpy as np
 import scipy  # loads its modules when they are first used
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, IntArray, as_array
+from ident.arrays import FloatArray, IntArray, as_array, require_entries, takes
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.instants import Instants
@@ -239,6 +239,7 @@ def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
     return replace(model, robot=replace(model.robot, gravity_m_s2=gravity_m_s2))
 
 
+@takes(model=Model, instants=Sequence)
 def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: ArrayLike) -> TurnedGeometry | None:
     """Look for another geometry that explains recordings clearly better than the declared one.
 
@@ -251,6 +252,7 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Arra
     Returns:
         the hypothesis with the largest fall of the errors; None where the declared geometry is as good as any.
     """
+    require_entries("instants", instants, Instants, "give `Identification.instants`")
     if model.is_redundant or not instants:
         return None
     nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")

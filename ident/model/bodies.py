@@ -12,9 +12,8 @@ Consistent Inertial Parameter Identification, 2018). P is linear in the ten para
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 from numbers import Real
 
 import numpy as np
@@ -28,6 +27,7 @@ LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "
 """Inertia about the link frame's origin, first moments, mass, in the paper's order; a payload is a link too (§2.2)."""
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
+ROUNDING = 1e-3  #: Share of its size by which rounding in a drawing may make an inertia impossible
 _ROWS, _COLUMNS = np.triu_indices(3)
 
 
@@ -36,8 +36,8 @@ class Payload:
     """A weighed body as it was mounted; each mounting has its own unknowns.
 
     Raises:
-        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, or no body of positive mass has the
-            values, as far as enough of them are given to tell.
+        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, the mass is not above zero, or no
+            body has such an inertia.
     """
 
     name: str  #: of the body
@@ -45,6 +45,9 @@ class Payload:
     #: Known inertial parameters by their names in LINK_PARAMETERS, in the frame of the joint that carries it (paper
     #: eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
     known: dict[str, float] = field(default_factory=dict)
+    #: Tolerance of the weighed mass [kg], a standard deviation; 0 where none is declared. `Calibration.payload_mass`
+    #: has what it makes of each gain, and `weigh` has it in σ; σ of the gains does not. A cell file has its own.
+    mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
         require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
@@ -56,12 +59,19 @@ class Payload:
                 f"payload {self.name!r} has the known parameters {', '.join(map(repr, foreign))}; expected names among "
                 f"{', '.join(LINK_PARAMETERS)}; write its mass as {{'m': 4.59}}"
             )
-        contradiction = _contradiction(self.known)
-        if contradiction:
+        require_kind("mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01")
+        if not 0.0 <= self.mass_tolerance_kg < inf:
+            found = f"a mass tolerance of {self.mass_tolerance_kg:g} kg"
+            raise ModelError(f"payload {self.name!r} has {found}; expected zero or more; give that of the scale")
+        bad = [f"{name} = {value}" for name, value in self.known.items() if not isfinite(value)]
+        if bad:
             raise ModelError(
-                f"payload {self.name!r} has {contradiction}; expected values of a body, in SI units, the inertia about "
-                "the origin of the joint's frame (paper eq. 5); correct them, or give the mass alone"
+                f"payload {self.name!r} has {', '.join(bad)}; expected finite numbers; leave out what is not known"
             )
+        mass_kg = self.known.get("m")
+        if mass_kg is not None and not mass_kg > 0.0:  # a negative mass would reverse the sign of every gain
+            raise ModelError(f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; weigh it")
+        _require_possible_inertia(self)
 
     @property
     def known_parameters(self) -> FloatArray:
@@ -69,33 +79,36 @@ class Payload:
         return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])
 
 
-_THIN = 1e-6  #: Extent of a body in a direction, as a share of that in all, below which it has none
-_SLACK = 1e-6  #: Share by which values that were rounded in a data sheet may miss those of a body
+def _require_possible_inertia(payload: Payload) -> None:
+    """Refuse an inertia that no distribution of mass has, as far as what is known says so; a point mass may be.
 
-
-def _contradiction(known: Mapping[str, float]) -> str:
-    """Say why no body of positive mass has some inertial parameters; empty where one has."""
-    for name, value in known.items():
-        if not isfinite(value):
-            return f"{name} = {value:g}"
-    if known.get("m", 1.0) <= 0.0:
-        return f"a mass of {known['m']:g} kg"
-    if not set(LINK_PARAMETERS[:6]) <= set(known):
-        return ""
-    matrix = pseudo_inertia(np.array([known.get(name, 0.0) for name in LINK_PARAMETERS]))
-    is_whole = set(LINK_PARAMETERS) <= set(known)
-    compared = matrix if is_whole else matrix[:3, :3]
-    diagonal = np.abs(np.diag(compared))
-    extent = max(float(diagonal[:3].sum()), float(np.finfo(np.float64).tiny))
-    # A point or a rod has no extent in some directions: there rounding is all that there is.
-    diagonal[:3] = np.maximum(diagonal[:3], _THIN * extent)
-    size = np.sqrt(diagonal)
-    least = float(np.linalg.eigvalsh(compared / np.outer(size, size))[0])
-    if least >= -_SLACK:
-        return ""
-    if float(np.linalg.eigvalsh(matrix[:3, :3])[0]) < -_SLACK * float(np.trace(matrix[:3, :3])):
-        return "moments of inertia of which one is below zero or above the sum of the other two"
-    return "an inertia that is too small for its mass so far from the joint's frame"
+    Raises:
+        ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have a negative value.
+    """
+    moments = set(LINK_PARAMETERS[:6])
+    if not moments <= set(payload.known):
+        negative = [name for name in ("Ixx", "Iyy", "Izz") if payload.known.get(name, 0.0) < 0.0]
+        if negative:
+            found = ", ".join(f"{name} = {payload.known[name]:g} kg m²" for name in negative)
+            raise ModelError(f"payload {payload.name!r} has {found}; expected moments of inertia of zero or more")
+        return
+    pseudo = pseudo_inertia(payload.known_parameters)
+    if set(payload.known) != set(LINK_PARAMETERS):
+        pseudo = pseudo[:3, :3]
+    size = max(float(np.trace(pseudo[:3, :3])), 0.0)
+    scale = np.ones(len(pseudo))
+    # The rows of the second moments and of the mass have other units: compare them at a common size.
+    scale[:3] = np.sqrt(size) or 1.0
+    scale[3:] = np.sqrt(payload.known.get("m", 1.0))
+    least = float(np.linalg.eigvalsh(pseudo / np.outer(scale, scale))[0])
+    if least >= -ROUNDING:
+        return
+    inertia = ", ".join(f"{name} = {payload.known[name]:g}" for name in LINK_PARAMETERS if name in payload.known)
+    raise ModelError(
+        f"payload {payload.name!r} has an inertia that no body has: {inertia} [kg m², kg m, kg]; expected one whose "
+        "principal moments are positive, none above the sum of the others, about the joint's origin (Huygens-Steiner "
+        "with mx, my, mz included); check signs and frame, or give the mass alone"
+    )
 
 
 def pseudo_inertia(link: FloatArray) -> FloatArray:

@@ -21,9 +21,9 @@ from ident.model.robot import Motion
 STATES = 60  #: States on which W_st is computed; each gives a row for every joint
 RANGE = 1.5  #: Positions, speeds and accelerations are drawn from ± this [rad or m, s]
 RANK_TOLERANCE = 1e-9  #: Singular values below this share of the largest are rounding error
-WEIGHT_TOLERANCE = 1e-3
-"""Share of a weight that may differ. Filtered data determine it to four digits; a length that differs by a millimetre
-in a metre is the correction of a description, not another robot."""
+WEIGHT_TOLERANCE = 1e-2
+"""Share of a weight that may differ. Filtered data determine it to four digits; a length that differs by a few
+millimetres is the correction of a description, not another robot."""
 ROUNDED = 2e-6  #: Weights are written with six decimals, and left out below
 TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 """A standard parameter that a base parameter gathers, in its name: " + 0.4*m3"."""
@@ -40,7 +40,9 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
         names: of the base parameters, each a leading standard parameter of this model and what it gathers.
     """
     compared = [name for name in names if not name.split(" ", 1)[0].endswith(LOADED)]
-    if model.robot.closures or not compared:
+    # Standard parameters as they are, none gathered with others, are right for their robot.
+    is_grouped = any(TERM.search(name) for name in compared)
+    if model.robot.closures or not is_grouped:
         return None
     kept = [number for number, column in enumerate(model.columns) if not column.name.endswith(LOADED)]
     regressor = model.regressor(_drawn_states(model.robot.axis_count))[:, kept]

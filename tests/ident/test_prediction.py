@@ -29,9 +29,7 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Model
-from ident.model.urdf import robot_from_urdf
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
-from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, a_calibration, calibrated
 
 
@@ -274,14 +272,21 @@ def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -
         check_settings(effect, given_, 0, 12)
 
 
+def _with_longer_links(model: Model, times: float) -> Model:
+    """The same robot with all offsets between its joints longer."""
+    joints = [replace(joint, translation_m=times * joint.translation_m) for joint in model.robot.joints]
+    return Model(replace(model.robot, joints=tuple(joints)), model.drive_train)
+
+
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
     calibration, data = calibrated(identified), identified.datasets[0]
     with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
         predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)
+    other = _with_longer_links(identified.model, 1.2)
+    with pytest.raises(ModelError, match=r"which another geometry gathers; expected a calibration of the model's"):
+        predict_current(calibration, other, data)
+    measured_again = _with_longer_links(identified.model, 1.002)
+    predict_current(calibration, measured_again, data)
     seventh = replace(calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")))
     with pytest.raises(ModelError, match="'Izz7"):
         predict_torque(seventh, identified.model, data)
-    longer = Model(robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), identified.model.drive_train)
-    for predict in (predict_torque, predict_current):
-        with pytest.raises(ModelError, match=r"which another geometry gathers; expected a calibration of the model's"):
-            predict(calibration, longer, data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -42,15 +43,34 @@ OF_A_RUN: list[tuple[str, Change, str]] = [
     ("ragged positions", lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]), "'bare': position_rad is no array"),
     ("words", lambda r: replace(r, current_a=[["one", "two", "three"]]), "'bare': current_a is no array of numbers"),
     ("transposed", lambda r: replace(r, position_rad=r.position_rad.T), r"\(3, \d+\); expected .* transpose it\?"),
+    (
+        "complex currents",
+        lambda r: replace(r, current_a=r.current_a + 0.5j),
+        "'bare': current_a is of complex numbers .* expected real ones; give their real part",
+    ),
+    (
+        "masked positions",
+        lambda r: replace(r, position_rad=np.ma.masked_array(r.position_rad, r.time_s[:, None] * [1, 1, 1] > 9.0)),
+        r"position_rad is a masked array with \d+ masked values; expected numbers; fill them",
+    ),
+    (
+        "objects",
+        lambda r: replace(r, current_a=np.array([[None, 1.0, "x"]] * len(r.time_s), dtype=object)),
+        "current_a is no array of numbers: it holds None of type NoneType; expected .* convert it",
+    ),
+    (
+        "numbers as text",
+        lambda r: replace(r, current_a=r.current_a.astype(str)),
+        "'bare': current_a is no array of numbers: its type is <U32",
+    ),
+    (
+        "complex temperatures",
+        lambda r: replace(r, temperature_c=r.current_a + 0.5j),
+        "'bare': temperature_c is of complex numbers",
+    ),
     ("no position", lambda r: replace(r, position_rad=None), "'bare': position_rad .*expected"),
     ("valid of samples", lambda r: replace(r, valid=np.ones(len(r.time_s))), r"'bare': valid has shape .* expected \("),
     ("few moves", lambda r: replace(r, move=np.zeros(9)), r"'bare': move has shape \(9,\); expected \(\d+,\)"),
-    (
-        "masked currents",
-        lambda r: replace(r, current_a=np.ma.masked_greater(r.current_a, 0.0)),
-        "'bare': current_a masks some of its values; expected a number for each",
-    ),
-    ("complex positions", lambda r: replace(r, position_rad=r.position_rad + 0j), "position_rad holds complex numbers"),
     ("a mass for the payload", lambda r: replace(r, payload=4.0), "'bare' is of type float; expected Payload; write"),
 ]
 
@@ -149,3 +169,122 @@ def test_several_runs_are_named_one_by_one(small_truth: Truth, short: tuple[iden
     still = [replace(run, position_rad=run.position_rad * [1.0, 0.0, 1.0]) for run in short]
     with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: axis q1: found q1 never moves"):
         ident.identify(small_truth.model, still, ident.Conditioning())
+
+
+def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(short: tuple[ident.Run, ident.Run]) -> None:
+    run = short[0]
+    train = DRIVE_TRAIN
+    expected = ident.differentiate(run, train)
+    for kind in (np.ma.masked_array, lambda values: values.astype(object), np.ndarray.tolist):
+        same = ident.differentiate(replace(run, current_a=kind(run.current_a)), train)
+        assert np.array_equal(same.current_a, expected.current_a)
+
+
+@pytest.fixture(scope="module")
+def arguments(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> dict[str, Any]:
+    """Right arguments of the public functions, by their names."""
+    found = ident.identify(small_truth.model, short, ident.Conditioning())
+    axes = ("J1", "J2", "J3")
+    calibration = ident.calibration_of(found, axes, found.estimate.gains)
+    data = ident.differentiate(short[0], small_truth.model.drive_train)
+    return {
+        "calibration": calibration,
+        "model": small_truth.model,
+        "data": data,
+        "run": short[0],
+        "runs": short,
+        "loaded": short[1:],
+        "quiet": short[:1],
+        "current_a": short[0].current_a,
+        "found": found,
+        "axes": axes,
+        "nameplate": found.estimate.gains,
+        "motion": data.motion(),
+        "rate_hz": 500.0,
+        "drive_train": small_truth.model.drive_train,
+        "conditioning": ident.Conditioning(),
+        "instants": found.instants,
+        "gains": found.estimate.gains,
+        "start": None,
+        "rng": np.random.default_rng(0),
+    }
+
+
+FUNCTIONS = (
+    "predict_torque",
+    "predict_current",
+    "measured_torque",
+    "weigh",
+    "external_torque",
+    "prediction_band",
+    "calibration_of",
+    "planned",
+    "differentiate",
+    "identify",
+    "diagnose",
+    "exchanged_channels",
+    "find_turned_geometry",
+    "find_effects",
+    "gather",
+)
+WRONG_VALUES: tuple[Any, ...] = (3.5, "words", object(), {"a": 1}, ["x", "y"], 1j * np.ones((4, 3)))
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_no_public_function_has_a_traceback_for_an_argument_of_another_type(
+    arguments: dict[str, Any], function: str
+) -> None:
+    called = getattr(lax, function)
+    needed = [one.name for one in inspect.signature(called).parameters.values() if one.default is one.empty]
+    right = [arguments[name] for name in needed] if function != "gather" else [arguments["found"], arguments["runs"]]
+    for place in range(len(right)):
+        for value in WRONG_VALUES:
+            if needed[place:] and needed[place] == "rate_hz" and isinstance(value, float):
+                continue  # it is one
+            wrong = list(right)
+            wrong[place] = value
+            with pytest.raises(ident.IdentificationError, match="expected"):
+                called(*wrong)
+
+
+def test_a_run_in_the_place_of_data_or_of_a_band_is_named(arguments: dict[str, Any]) -> None:
+    calibration = arguments["calibration"]
+    model = arguments["model"]
+    run = arguments["run"]
+    with pytest.raises(ident.ModelError, match="loaded of weigh is of type Run; expected Iterable; call weigh"):
+        lax.weigh(calibration, model, run)
+    with pytest.raises(ident.ModelError, match="data of predict_torque is of type Run; expected Dataset"):
+        lax.predict_torque(calibration, model, run)
+    with pytest.raises(ident.ModelError, match="conditioning of external_torque is of type Run; expected Cond"):
+        lax.external_torque(calibration, model, run, run)
+
+
+@pytest.mark.parametrize(
+    ("axes", "nameplate", "words"),
+    [
+        ("abc", [1.0, 1.0, 1.0], "axes is the text 'abc'; expected a list of names"),
+        ([1, 2, 3], [1.0, 1.0, 1.0], "an entry of axes is of type int; expected str"),
+        (["J1", "J1", "J2"], [1.0, 1.0, 1.0], "axes are J1, J1, J2; expected another name for each"),
+        (["J1", "J2", "J3"], [1.0, 0.0, 1.0], r"nameplate is \[1.0, 0.0, 1.0\]; expected .* none of them zero"),
+        (["J1", "J2", "J3"], [[1.0], [1.0], [1.0]], "nameplate is .*expected one gain per axis"),
+    ],
+)
+def test_a_calibration_of_odd_axes_is_refused(arguments: dict[str, Any], axes: Any, nameplate: Any, words: str) -> None:
+    with pytest.raises(ident.ModelError, match=words):
+        ident.calibration_of(arguments["found"], axes, nameplate)
+
+
+def test_the_tolerance_of_a_payloads_mass_is_that_of_a_cell_file(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], arguments: dict[str, Any]
+) -> None:
+    declared = replace(MOUNTED, mass_tolerance_kg=0.02)
+    found = ident.identify(small_truth.model, [short[0], replace(short[1], payload=declared)], ident.Conditioning())
+    calibration = ident.calibration_of(found, arguments["axes"], arguments["nameplate"])
+    # What `daq.calibration_of` does with `mass_tolerance_kg` of the cell file
+    by_cell_file = [one.weighed_to(0.02) for one in arguments["calibration"].payload_mass]
+    assert list(calibration.payload_mass) == by_cell_file
+    assert calibration.payload_mass[0].gains[1].tolerance_std > 0.0
+    body = ident.weigh(calibration, small_truth.model, short[1:])
+    assert body.mass_reference_std_kg == pytest.approx(0.02, rel=0.1)
+    exact = ident.weigh(arguments["calibration"], small_truth.model, short[1:])
+    assert exact.mass_reference_std_kg == 0.0

@@ -159,6 +159,11 @@ def test_what_files_say_is_escaped() -> None:
     assert f"Cell {HOSTILE}" in Reader(text).texts
 
 
+def test_a_calibration_of_the_library_has_no_program_and_no_time() -> None:
+    text = _page(replace(demo_calibration(), created="", software=""))
+    assert "made time not known by software not known." in " ".join(text.split())
+
+
 def test_a_term_without_a_name_is_its_curve() -> None:
     calibration = _with_smooth()
     curve = curve_of(calibration.effects[0], calibration)

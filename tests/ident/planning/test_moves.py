@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -106,7 +107,7 @@ def test_torques_keep_the_efforts_of_the_urdf(model: ident.Model, plan: ident.Pl
     weak = EXAMPLE.URDF.replace('effort="99"', 'effort="60"')
     moves = ident.plan_moves(model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, urdf=weak, exchanges=20)
     gains = np.array(EXAMPLE.NAMEPLATE_NM_A)
-    search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, weak, ident.Conditioning(), 40.0)
+    search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, weak, ident.Conditioning())
     assert np.isfinite(search.effort).all()
 
     def largest(planned: ident.PlannedMoves) -> float:
@@ -115,6 +116,32 @@ def test_torques_keep_the_efforts_of_the_urdf(model: ident.Model, plan: ident.Pl
 
     assert largest(moves) <= 1.02 / EFFORT_MARGIN  # looked at 50 times a second
     assert largest(plan) > 1.0 / EFFORT_MARGIN
+
+
+def _planned_for(model: ident.Model, **settings: Any) -> Any:
+    return lax.plan_moves(model, LIMITS, EXAMPLE.DISC, [1, 1, 1], **settings)
+
+
+MOTIONS: list[tuple[str, dict[str, Any], Any, str]] = [
+    ("no rate", {}, 0.0, "rate_hz is 0; expected a finite number above 0; give the rate of the controller"),
+    ("negative rate", {}, -500.0, "rate_hz is -500"),
+    ("rate of a text", {}, "500", "rate_hz is '500' of type str"),
+    ("too many", {}, 1e12, r"samples at 1e\+12 Hz; expected at most 1e\+07"),
+    ("a move of 0 s", {"move_s": np.array([1.0, 0.0])}, 500.0, "move_s has 0 s; expected durations above 0 s"),
+    ("a move of -5 s", {"move_s": np.array([-5.0, 1.0])}, 500.0, "move_s has -5 s"),
+    ("no duration", {"move_s": np.array([1.0, np.nan])}, 500.0, "move_s holds 1 non-finite values"),
+    ("a move too many", {"move_s": np.ones(3)}, 500.0, r"target_rad of shape \(3, 1\) and move_s of shape \(3,\)"),
+    ("a dwell of inf", {"dwell_s": np.inf}, 500.0, "dwell_s is inf"),
+]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rate_hz", "words"), [case[1:] for case in MOTIONS], ids=[case[0] for case in MOTIONS]
+)
+def test_moves_that_take_no_time_are_no_motion(changes: dict[str, Any], rate_hz: Any, words: str) -> None:
+    moves = ident.PlannedMoves(np.array([[0.0], [1.0], [0.0]]), np.array([1.0, 2.0]), 0.1, np.ones(1))
+    with pytest.raises(ident.ModelError, match=words):
+        replace(moves, **changes).motion(rate_hz)
 
 
 Call = Callable[[ident.Model], Any]
@@ -154,33 +181,27 @@ WRONG: list[tuple[str, Call, str]] = [
         lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=5.0),
         r"found room for \d moves in 5 s; expected at least 10, and better 30; give a longer `duration_s`",
     ),
-    (
-        "endless",
-        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=float("inf")),
-        "duration_s is inf; expected a number from 0 to 3600; give the duration of one run in seconds",
+    *(
+        (f"duration {value}", lambda m, value=value: _planned_for(m, duration_s=value), f"duration_s is .*{words}")
+        for value, words in (
+            (np.nan, "nan; expected a finite number above 0; give the time of one run, such as 40"),
+            (np.inf, "inf; expected a finite number above 0"),
+            (-5.0, "-5; expected a finite number above 0"),
+            (1e9, r"1e\+09 s; expected at most 3600 s for one run"),
+            ("40", "'40' of type str; expected a finite number"),
+        )
     ),
+    ("seed", lambda m: _planned_for(m, seed=-1), "seed is -1; expected a whole number, zero or above"),
+    ("exchanges", lambda m: _planned_for(m, exchanges=1.5), "exchanges is 1.5; expected a whole number"),
+    ("a file", lambda m: _planned_for(m, urdf=b"robot"), "urdf is of type bytes; expected str; give the text"),
     (
-        "no number",
-        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=float("nan")),
-        "duration_s is nan; expected a number",
-    ),
-    (
-        "text",
-        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], exchanges="many"),
-        "exchanges is 'many'; expected a number from 0",
-    ),
-    (
-        "slow as a glacier",
+        "slow",  # moves of days would have gigabytes of rows
         lambda m: lax.plan_moves(
             m, lax.JointLimits(LIMITS.lower, LIMITS.upper, [1e-9] * 3, LIMITS.acceleration), EXAMPLE.DISC, [1, 1, 1]
         ),
         "found room for 0 moves in 40 s",
     ),
-    (
-        "limits of words",
-        lambda m: lax.JointLimits(["low"], ["high"], [1], [1]),
-        "limits.lower is no array of numbers",
-    ),
+    ("words", lambda _: lax.JointLimits("abc", [1], [1], [1]), "limits.lower is no array of numbers"),
     (
         "no mass",
         lambda m: lax.plan_moves(m, LIMITS, lax.Payload("disc", "flange", {}), [1, 1, 1], exchanges=0),
@@ -193,9 +214,3 @@ WRONG: list[tuple[str, Call, str]] = [
 def test_what_no_plan_can_be_made_of_is_refused(model: ident.Model, call: Call, words: str) -> None:
     with pytest.raises(ident.IdentificationError, match=words):
         call(model)
-
-
-@pytest.mark.parametrize("rate_hz", [0.0, -5.0, float("nan"), 1e9])
-def test_set_points_at_no_rate_are_refused(plan: ident.PlannedMoves, rate_hz: float) -> None:
-    with pytest.raises(ident.IdentificationError, match=r"rate_hz is .*; expected a number from 1 to 100000"):
-        plan.motion(rate_hz)
