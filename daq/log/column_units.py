@@ -21,59 +21,59 @@ _IN_BRACKETS = re.compile(r"\[([^\[\]]+)\]\s*$")
 
 
 @dataclass(frozen=True, slots=True)
-class Unit:
+class ColumnUnit:
     """A unit of a column."""
 
     kind: str  #: of the quantity, for messages
     scale: float  #: in the kind's first unit
 
 
-_RAD = Unit("angle", 1.0)
-_DEG = Unit("angle", pi / 180.0)
-_RAD_S = Unit("angular velocity", 1.0)
-_DEG_S = Unit("angular velocity", pi / 180.0)
-_RPM = Unit("angular velocity", pi / 30.0)
-_MICROSECOND = Unit("time", 1e-6)
-_AMPERE = Unit("current", 1.0)
-_NM = Unit("torque", 1.0)
-_COUNT = Unit("counts", 1.0)
-_CELSIUS = Unit("temperature", 1.0)
-_FAHRENHEIT = Unit("temperature in °F", 1.0)
+_RAD = ColumnUnit("angle", 1.0)
+_DEG = ColumnUnit("angle", pi / 180.0)
+_RAD_S = ColumnUnit("angular velocity", 1.0)
+_DEG_S = ColumnUnit("angular velocity", pi / 180.0)
+_RPM = ColumnUnit("angular velocity", pi / 30.0)
+_MICROSECOND = ColumnUnit("time", 1e-6)
+_AMPERE = ColumnUnit("current", 1.0)
+_NM = ColumnUnit("torque", 1.0)
+_COUNT = ColumnUnit("counts", 1.0)
+_CELSIUS = ColumnUnit("temperature", 1.0)
+_FAHRENHEIT = ColumnUnit("temperature in °F", 1.0)
 UNITS = {
     "rad": _RAD,
     "deg": _DEG,
     "°": _DEG,
-    "m": Unit("length", 1.0),
-    "mm": Unit("length", 1e-3),
+    "m": ColumnUnit("length", 1.0),
+    "mm": ColumnUnit("length", 1e-3),
     "rad/s": _RAD_S,
     "deg/s": _DEG_S,
     "°/s": _DEG_S,
     "rpm": _RPM,
     "1/min": _RPM,
-    "m/s": Unit("velocity", 1.0),
-    "mm/s": Unit("velocity", 1e-3),
-    "rad/s^2": Unit("angular acceleration", 1.0),
-    "s": Unit("time", 1.0),
-    "sec": Unit("time", 1.0),
-    "ms": Unit("time", 1e-3),
+    "m/s": ColumnUnit("velocity", 1.0),
+    "mm/s": ColumnUnit("velocity", 1e-3),
+    "rad/s^2": ColumnUnit("angular acceleration", 1.0),
+    "s": ColumnUnit("time", 1.0),
+    "sec": ColumnUnit("time", 1.0),
+    "ms": ColumnUnit("time", 1e-3),
     "us": _MICROSECOND,
     "\u00b5s": _MICROSECOND,
     "\u03bcs": _MICROSECOND,
-    "ns": Unit("time", 1e-9),
+    "ns": ColumnUnit("time", 1e-9),
     "a": _AMPERE,
     "arms": _AMPERE,
-    "ma": Unit("current", 1e-3),
+    "ma": ColumnUnit("current", 1e-3),
     "nm": _NM,
     "n.m": _NM,
     "n·m": _NM,
     "n*m": _NM,
-    "mnm": Unit("torque", 1e-3),
-    "n": Unit("force", 1.0),
-    "kn": Unit("force", 1e3),
-    "v": Unit("voltage", 1.0),
-    "mv": Unit("voltage", 1e-3),
-    "%": Unit("share", 1e-2),
-    "‰": Unit("share", 1e-3),
+    "mnm": ColumnUnit("torque", 1e-3),
+    "n": ColumnUnit("force", 1.0),
+    "kn": ColumnUnit("force", 1e3),
+    "v": ColumnUnit("voltage", 1.0),
+    "mv": ColumnUnit("voltage", 1e-3),
+    "%": ColumnUnit("share", 1e-2),
+    "‰": ColumnUnit("share", 1e-3),
     "counts": _COUNT,
     "count": _COUNT,
     "inc": _COUNT,
@@ -84,16 +84,16 @@ UNITS = {
     "degc": _CELSIUS,
     "°f": _FAHRENHEIT,
     "degf": _FAHRENHEIT,
-    "k": Unit("absolute temperature", 1.0),
-    "w": Unit("power", 1.0),
-    "hz": Unit("frequency", 1.0),
+    "k": ColumnUnit("absolute temperature", 1.0),
+    "w": ColumnUnit("power", 1.0),
+    "hz": ColumnUnit("frequency", 1.0),
 }
 """Known units in lower case. Effective and peak amperes are the same here: few files tell which they hold."""
 TWINS = {"rad": "m", "deg": "mm", "rad/s": "m/s", "deg/s": "mm/s"}
 """Unit of the prismatic axes of a robot that has both, by that of the description."""
 
 
-def unit_of(text: str) -> Unit | None:
+def column_unit_of(text: str) -> ColumnUnit | None:
     """Return the unit that a field is, with brackets or without; None if it is not known."""
     return UNITS.get(bare_unit(text).lower())
 
@@ -179,8 +179,8 @@ def check_unit(place: str, stated: str, expected: Expected, *, in_name: bool = F
     Raises:
         TableUnfit: both units are known, and they contradict each other.
     """
-    unit = unit_of(stated)
-    allowed = [unit_of(text) for text in expected.texts]
+    unit = column_unit_of(stated)
+    allowed = [column_unit_of(text) for text in expected.texts]
     if unit is None or None in allowed:
         return
     if in_name and unit.kind not in {one.kind for one in allowed if one is not None}:
@@ -200,7 +200,7 @@ def check_unit(place: str, stated: str, expected: Expected, *, in_name: bool = F
     )
 
 
-def _agree(unit: Unit, described: Unit, expected: Expected) -> bool:
+def _agree(unit: ColumnUnit, described: ColumnUnit, expected: Expected) -> bool:
     """Whether a column may have a unit, under a factor that may convert it."""
     factor = 1.0 if expected.factor is None else abs(expected.factor)
     if factor == 1.0:

@@ -19,7 +19,7 @@ import numpy as np
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn
 from daq.errors import TableUnfit, counted
 from daq.files import read_regular
-from daq.log.column_units import check_units, expected_units, unit_of
+from daq.log.column_units import check_units, column_unit_of, expected_units
 from daq.log.table import unreadable
 
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
@@ -276,7 +276,7 @@ class _Parts:
         read = [fields[index] for index in _indices(columns, names)]
         if any(field.lower() in MISSING for field in read):
             return None
-        return number if any(unit_of(field) is not None for field in read) else None
+        return number if any(column_unit_of(field) is not None for field in read) else None
 
     def end(self, start: int) -> int:
         """Return the line behind the last row: empty lines and comments after it are no rows."""

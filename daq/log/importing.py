@@ -51,7 +51,7 @@ from daq.log.plausibility import (
     counting_signs,
     in_si,
     require_changing,
-    require_different,
+    require_own_columns,
     signed_counts,
     warn_of_unsigned,
 )
@@ -259,8 +259,8 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     position = section_values(wanted.position, files)
     current = section_values(wanted.current, files)
     require_changing(position, current, wanted, files)
-    require_different(wanted.position, position, files)
-    require_different(wanted.current, current, files)
+    require_own_columns(wanted.position, position, files)
+    require_own_columns(wanted.current, current, files)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
         position, remarks = signed_counts(position, wanted)

@@ -178,7 +178,7 @@ def require_changing(
             )
 
 
-def require_different(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
+def require_own_columns(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
     """Refuse the same numbers for two axes: a copy of a column, or of a file, has the place of another one.
 
     Args:

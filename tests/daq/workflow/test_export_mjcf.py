@@ -351,6 +351,7 @@ def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None
     without, _ = split_installed(replace(known, covariance_factor=rows))
     left = np.delete(np.arange(size), len(known.gains))
     assert without.parameters == known.parameters[1:]
+    assert without.covariance is not None
     np.testing.assert_allclose(without.covariance, (factor @ factor.T)[np.ix_(left, left)], atol=1e-12)
 
 
