@@ -171,6 +171,10 @@ class _Publisher:
         return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
 
 
+SEPARATE = (
+    "no message has all fields, and messages of different publishers are not joined: write each field to a CSV file, "
+    "with rows of the same instants, and name the files by `file` of `position` and `current`"
+)
 FEWEST_OF_A_PUBLISHER = 10  #: Messages by which its rhythm is known
 EVEN_SHARE = 0.05  #: Largest difference of a step from the usual one in an even row of stamps, as a share of it
 CENTRED_SHARE = 0.35  #: Offset of a second row, as a share of the step, above which it may be every other stamp of one
@@ -301,18 +305,25 @@ class _Rows:
             if any(one.joints & other.joints & wanted for other in others):
                 sharing.append(one)
         if sharing:
+            fullest = self._fullest(sharing)
+            is_full = {field for field, _ in self._columns} <= set(fullest.fields)
+            choose = (
+                f"choose one in the import description, as in `publisher: {fullest.number}`, or record again without "
+                "the others"
+            )
             raise _unfit(
                 self._path,
                 f"{len(sharing)} publishers of the same joints on one topic: {'; '.join(map(str, sharing))}",
                 "one publisher of each joint",
-                f"choose one in the import description, as in `publisher: {self._fullest(sharing).number}`, or record "
-                "again without the others",
+                choose if is_full else SEPARATE,
             )
         for one in known:
             lacking = [field for field, joint in self._columns if joint in one.joints and field not in one.fields]
             if lacking:
                 found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
-                raise _unfit(self._path, found, "one value a joint", "does this controller publish it?")
+                is_elsewhere = any(lacking[0] in other.fields for other in self._publishers.values())
+                remedy = SEPARATE if is_elsewhere else "does this controller publish it?"
+                raise _unfit(self._path, found, "one value a joint", remedy)
 
     def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
         """Return the publisher with most of the fields that are read, then with most messages."""

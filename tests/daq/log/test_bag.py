@@ -231,6 +231,17 @@ def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) 
         read(bag, publisher=2)
 
 
+@pytest.mark.parametrize("publisher", [None, 1])
+def test_positions_and_efforts_in_separate_messages_have_a_way(publisher: int | None, tmp_path: Path) -> None:
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row, effort=[])))
+        parts.append(("/joint_states", message(row, position=[])))
+    bag = write_bag(tmp_path / "run.mcap", parts)
+    with pytest.raises(TableUnfit, match="write each field to a CSV file"):
+        read(bag, publisher=publisher)
+
+
 def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
     """A second node with the same joints, frame and fields: its stamps alone are others."""
     stamped = [(START_NS + row * STEP_NS, message(row)) for row in range(ROWS)]
