@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,7 +42,9 @@ def export_urdf_verb(
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
+    from daq.report.text import origin_text
     from daq.report.urdf_views import urdf_report, urdf_view
+    from daq.workflow.mjcf_effects import split_installed
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
     from daq.workflow.validate import on_cell
 
@@ -63,9 +66,10 @@ def export_urdf_verb(
     parse_markup(content, str(given))  # before any other reader sees it
     if urdf is None:
         declared = _declared(known, given)
+        known, _ = split_installed(known)  # a URDF holds no effects
         known, model = on_cell(known, declared)
         limits = cell_limits(declared)
-        same = declared.digest == known.configuration_sha256
+        same = _is_same(known, declared)
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
         model, limits, same = *_plain(content.decode("utf-8")), None
@@ -74,7 +78,7 @@ def export_urdf_verb(
     with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)
     updates = joint_updates(robot)
-    provenance = f"Inertias by {software()} from the calibration of {known.cell}, {known.created}"
+    provenance = f"Inertias by {software()} from {origin_text(known.cell, known.created)}"
     updated = update_urdf(content, str(given), updates, provenance)
     _write(updated, robot, out)
     if json:
@@ -97,7 +101,7 @@ def export_mjcf_verb(
     """
     from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
     from daq.workflow.full_choice import full_choice
-    from daq.workflow.mjcf_effects import joint_effects
+    from daq.workflow.mjcf_effects import joint_effects, split_installed
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import cell_limits, random_states
     from daq.workflow.validate import on_cell
@@ -107,7 +111,8 @@ def export_mjcf_verb(
     known = read_calibration(calibration)
     _require_explained(known, calibration)
     declared = _declared(known, cell)
-    same = declared.digest == known.configuration_sha256
+    same = _is_same(known, declared)
+    known, missing = split_installed(known)
     known, model = on_cell(known, declared)
     limits = cell_limits(declared)
     if known.full_parameters is None:
@@ -116,6 +121,7 @@ def export_mjcf_verb(
         choice = full_choice(known, model, limits, declared.urdf)
     followed = choice.model.follow(random_states(choice.model, limits))
     effects = joint_effects(known, choice.model.robot)
+    effects = replace(effects, left_out=(*effects.left_out, *missing))
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
@@ -152,6 +158,13 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
             zip(parameters.model.robot.joints, parameters.links, strict=True), start=1
         )
     }
+
+
+def _is_same(calibration: Calibration, cell: Cell) -> bool | None:
+    """Whether a cell file is that of the fit; None where the calibration does not name one, as of a library."""
+    if not calibration.configuration_sha256:
+        return None
+    return cell.digest == calibration.configuration_sha256
 
 
 def _require_explained(calibration: Calibration, path: Path) -> None:

@@ -110,6 +110,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         robot = robot_with(chain, urdf, model.robot.gravity_m_s2, model.robot.platform)
     except ModelError as error:
         found, _, expected = str(error).partition("; expected ")
+        found = f"{model.robot.urdf}: {found}"  # the place is that of the cell file, which only names it
         expected = f"a URDF of an arm: {expected}" if expected else "a URDF of an arm"
         if OTHER_JOINT in found:
             expected += "; `hold: {JOINT: POSITION}` fixes a joint that is no axis"

@@ -29,7 +29,7 @@ from daq.log.table import (
     rows_in_time,
     stamps_of_ns,
 )
-from ident.arrays import BoolArray
+from ident.arrays import BoolArray, FloatArray
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
@@ -171,6 +171,14 @@ class _Publisher:
         return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
 
 
+SEPARATE = (
+    "no message has all fields, and messages of different publishers are not joined: write each field to a CSV file, "
+    "with rows of the same instants, and name the files by `file` of `position` and `current`"
+)
+FEWEST_OF_A_PUBLISHER = 10  #: Messages by which its rhythm is known
+EVEN_SHARE = 0.05  #: Largest difference of a step from the usual one in an even row of stamps, as a share of it
+CENTRED_SHARE = 0.35  #: Offset of a second row, as a share of the step, above which it may be every other stamp of one
+MOSTLY = 0.95  #: Share of the steps that are even in such a row
 SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
 UNDECIDED = 1000  #: Messages with a stamp of 0 that wait for a later one, which says what 0 means
 
@@ -297,18 +305,25 @@ class _Rows:
             if any(one.joints & other.joints & wanted for other in others):
                 sharing.append(one)
         if sharing:
+            fullest = self._fullest(sharing)
+            is_full = {field for field, _ in self._columns} <= set(fullest.fields)
+            choose = (
+                f"choose one in the import description, as in `publisher: {fullest.number}`, or record again without "
+                "the others"
+            )
             raise _unfit(
                 self._path,
                 f"{len(sharing)} publishers of the same joints on one topic: {'; '.join(map(str, sharing))}",
                 "one publisher of each joint",
-                f"choose one in the import description, as in `publisher: {self._fullest(sharing).number}`, or record "
-                "again without the others",
+                choose if is_full else SEPARATE,
             )
         for one in known:
             lacking = [field for field, joint in self._columns if joint in one.joints and field not in one.fields]
             if lacking:
                 found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
-                raise _unfit(self._path, found, "one value a joint", "does this controller publish it?")
+                is_elsewhere = any(lacking[0] in other.fields for other in self._publishers.values())
+                remedy = SEPARATE if is_elsewhere else "does this controller publish it?"
+                raise _unfit(self._path, found, "one value a joint", remedy)
 
     def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
         """Return the publisher with most of the fields that are read, then with most messages."""
@@ -339,11 +354,30 @@ class _Rows:
             raise self._incomplete_row(columns, stamp_ns[row], present[row], is_number[row])
         remarks = self._remarks(present, is_number, inside)
         clock = stamps_of_ns(stamp_ns[inside])
+        self._require_one_rhythm(clock.time_s)
         stamps = None if time is None else clock
         digest = digest_of(values[inside], clock)
         first_row = kept.start + inside.start
         table = Table(self._path, columns, values[inside], digest, stamps, first_row=first_row, remarks=remarks)
         return require_finite(table)
+
+    def _require_one_rhythm(self, time_s: FloatArray) -> None:
+        """Refuse the messages of two publishers that nothing but their stamps tells apart.
+
+        Raises:
+            TableUnfit: the stamps are two even rows of them, one between the other.
+        """
+        found = interleaved(time_s)
+        if found is None:
+            return
+        raise _unfit(
+            self._path,
+            f"stamps of two publishers of the same joints: {found.first} messages each {found.first_step_s:.6g} s, and "
+            f"{found.second} messages each {found.second_step_s:.6g} s between them",
+            "one publisher of each joint",
+            "record again with one of the two nodes stopped, or give one of them another topic or `frame_id`: then "
+            "`topic` or `publisher` of the import description chooses it",
+        )
 
     def _kept(self, part: KeptPart | None) -> slice:
         """Return the rows of the part that is kept."""
@@ -407,6 +441,69 @@ class _Rows:
             others = [one for one in self._publishers.values() if one.number != self._chosen]
             remarks += [f"left out, of another publisher: {other}" for other in others]
         return tuple(remarks)
+
+
+@dataclass(frozen=True, slots=True)
+class Interleaved:
+    """Two even rows of stamps, one between the other."""
+
+    first: int  #: number of stamps
+    first_step_s: float
+    second: int
+    second_step_s: float
+
+
+def interleaved(time_s: FloatArray) -> Interleaved | None:
+    """Return what two publishers left, each of which stamps evenly; None for the stamps of one.
+
+    One publisher may be uneven, but what is left when an even row of its stamps is taken out is not even as well.
+
+    Args:
+        time_s: stamps in the order of the messages, shape (k,).
+    """
+    ordered_s = np.sort(time_s)
+    if len(ordered_s) < 4 * FEWEST_OF_A_PUBLISHER:
+        return None
+    steps_s = np.diff(ordered_s)
+    usual_s = float(np.median(steps_s))
+    if usual_s <= 0.0 or np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY:
+        return None
+    candidates_s = (float(np.median(steps_s[:-1] + steps_s[1:])), usual_s, float(steps_s.max()))
+    for step_s in candidates_s:
+        for start in range(2):
+            is_first = _even_row(ordered_s, step_s, start)
+            first_s = ordered_s[is_first]
+            second_s = ordered_s[~is_first]
+            if min(len(first_s), len(second_s)) < FEWEST_OF_A_PUBLISHER:
+                continue
+            if _is_even(first_s) and _is_even(second_s):
+                first_step_s = float(np.median(np.diff(first_s)))
+                second_step_s = float(np.median(np.diff(second_s)))
+                is_same_rate = abs(second_step_s - first_step_s) <= EVEN_SHARE * first_step_s
+                shorter_s = float(np.quantile(steps_s, 0.25))
+                if is_same_rate and shorter_s > CENTRED_SHARE * first_step_s:
+                    continue  # one loop that is early and late in turn
+                return Interleaved(len(first_s), first_step_s, len(second_s), second_step_s)
+    return None
+
+
+def _even_row(time_s: FloatArray, step_s: float, start: int) -> BoolArray:
+    """Return which stamps follow each other at a step, from one of them on, shape (k,)."""
+    is_in_row = np.zeros(len(time_s), dtype=np.bool_)
+    is_in_row[start] = True
+    last_s = time_s[start]
+    for number in range(start + 1, len(time_s)):
+        if abs(time_s[number] - last_s - step_s) <= EVEN_SHARE * step_s:
+            is_in_row[number] = True
+            last_s = time_s[number]
+    return is_in_row
+
+
+def _is_even(time_s: FloatArray) -> bool:
+    """Whether most steps are the usual one, over all of the time."""
+    steps_s = np.diff(time_s)
+    usual_s = float(np.median(steps_s))
+    return usual_s > 0.0 and bool(np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY)
 
 
 def _require_possible(time_ns: int) -> None:

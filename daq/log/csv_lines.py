@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, CsvLayout, ImportDescription, PositionUnit, Section, TimeColumn
+from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn
 from daq.errors import TableUnfit, counted
 from daq.files import read_regular
+from daq.log.column_units import check_units, column_unit_of, expected_units
 from daq.log.table import unreadable
 
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
@@ -26,17 +27,8 @@ LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in mul
 COMMENT_SIGNS = ("#", "%", "//")  #: Of lines before and after the rows
 SHOWN = 40  #: Characters of a line in a message
 MINUS = "\u2212"  #: The minus sign of typography, which spreadsheets write
-POSITION_UNITS = {"rad": "rad", "deg": "deg", "°": "deg", "m": "m", "mm": "mm"}
-TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "\u00b5s": "us", "\u03bcs": "us", "ns": "ns"}
-VELOCITY_UNITS = {"rad/s": "rad/s", "deg/s": "deg/s", "°/s": "deg/s", "m/s": "m/s", "mm/s": "mm/s"}
-OF_CURRENTS = ("a", "ma", "arms", "nm", "mnm", "n", "n.m", "n·m", "n*m", "v", "%", "‰")
-OF_OTHERS = ("counts", "count", "inc", "incr", "ticks", "c", "°c", "degc", "k", "rpm", "1/min", "rad/s^2", "w", "hz")
-OTHER_UNITS = frozenset((*OF_CURRENTS, *OF_OTHERS))
-"""In lower case; those of positions, times and velocities are compared with the import description."""
 MISSING = frozenset(("", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "na", "n/a", "null", "none"))
 """Words for a number that is not there, in lower case: a line with them is a row."""
-TURNING_OR_NOT = {"rad": {"rad", "m"}, "deg": {"deg", "mm"}, "m": {"m"}, "mm": {"mm"}}
-"""Units in the file by that of the description: `deg` is mm for the prismatic axes of a robot that has both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +135,11 @@ def read_lines(
     named = [column for column in (*columns, *([] if time is None else [time.column])) if isinstance(column, str)]
     start, names = file.head(named)
     units_line = file.units_line(start, names, columns)
-    if units_line is not None:
-        _check_units(file, units_line, names, wanted, time)
+    expected = tuple(expected_units(path, wanted, time))
+    if units_line is None:
+        check_units(f"{path}:{start}", None, names, expected)
+    else:
+        check_units(f"{path}:{units_line + 1}", file.fields(units_line), names, expected)
         start = units_line + 1
         remarks.append(f"line {start} was taken for the units of the columns: {file.shown(units_line)}")
     end = file.end(start)
@@ -281,7 +276,7 @@ class _Parts:
         read = [fields[index] for index in _indices(columns, names)]
         if any(field.lower() in MISSING for field in read):
             return None
-        return number if any(_is_unit(field) for field in read) else None
+        return number if any(column_unit_of(field) is not None for field in read) else None
 
     def end(self, start: int) -> int:
         """Return the line behind the last row: empty lines and comments after it are no rows."""
@@ -304,6 +299,8 @@ class _Parts:
         empty = [number for number in range(start, end) if not self.lines[number].strip()]
         remarks = []
         left_out = set(comments)
+        if not has_time:
+            self._require_no_commented_row(comments)
         if comments:
             remarks.append(f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows")
         is_doubled = len(empty) > 1 and all(later - number == 2 for number, later in pairwise(empty))
@@ -311,6 +308,24 @@ class _Parts:
             left_out |= set(empty)
             remarks.append(f"left out: {counted(len(empty), 'empty line')} among the rows")
         return [number for number in range(start, end) if number not in left_out], remarks
+
+    def _require_no_commented_row(self, comments: Sequence[int]) -> None:
+        """Refuse a row that is commented out: at a stated rate, all that follow would move by a sample."""
+        sign = self.table.comment or ""
+        for number in comments:
+            text = self.lines[number].lstrip().removeprefix(sign).strip()
+            if '"' in text or not text:
+                continue
+            fields = split_fields(text, self.table.delimiter)
+            values = [read_number(field, self.table.decimal) for field in fields]
+            if len(values) > 1 and all(map(math.isfinite, values)):
+                raise TableUnfit(
+                    f"{self.path}:{number + 1}",
+                    found=f"{self.shown(number)}, a row of numbers that is commented out, at a rate without stamps",
+                    expected="every sample, as `rate_hz` gives each row its time",
+                    remedy="take the sign of the comment away, name a column of stamps by `time`, or import what is "
+                    "before it and what is behind it by `keep`",
+                )
 
     def check_quotes(self, numbers: Sequence[int]) -> None:
         """Refuse a quote that is not closed: where the fields of such a line end is a guess."""
@@ -338,66 +353,6 @@ def _indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
         elif column in names:
             found.append(names.index(column))
     return found
-
-
-def _bare_unit(field: str) -> str:
-    """Return a unit without brackets and space."""
-    return field.strip(" []()<>{}").replace(" ", "")
-
-
-def _is_unit(field: str) -> bool:
-    unit = _bare_unit(field)
-    known = unit in POSITION_UNITS or unit in TIME_UNITS or unit in VELOCITY_UNITS
-    return known or unit.lower() in OTHER_UNITS
-
-
-def _check_units(
-    file: _Parts, number: int, names: tuple[str, ...], wanted: ImportDescription, time: TimeColumn | None
-) -> None:
-    """Refuse a line of units that contradicts the import description.
-
-    Raises:
-        TableUnfit: a position, velocity, time or current is in another unit.
-    """
-    fields = file.fields(number)
-
-    def check(key: str, column: Column, known: dict[str, str], stated: str, allowed: set[str]) -> None:
-        for index in _indices((column,), names):
-            unit = _bare_unit(fields[index])
-            if unit in known and known[unit] not in allowed:
-                raise TableUnfit(
-                    f"{file.path}:{number + 1}, column {column}",
-                    found=f"unit {unit!r} in the line of units",
-                    expected=f"{stated!r}, the unit of `{key}` in the import description",
-                    remedy="correct that unit (of a current, its `factor`), or the line in the file",
-                )
-
-    def is_here(name: str) -> bool:
-        return Path(name).parts == file.path.parts[-len(Path(name).parts) :]
-
-    def columns_here(section: Section) -> list[tuple[int, Column]]:
-        """Number and column of each axis whose numbers are in this file."""
-        return [(axis, column) for axis, (name, column) in enumerate(section.places) if is_here(name)]
-
-    position = wanted.position
-    unit = position.unit.value
-    if position.unit is not PositionUnit.COUNTS:
-        for _, column in columns_here(position):
-            check("position", column, POSITION_UNITS, unit, TURNING_OR_NOT[unit])
-    velocity = wanted.velocity
-    if velocity is not None:
-        unit = velocity.unit.value
-        allowed = {f"{one}/s" for one in TURNING_OR_NOT[unit.removesuffix("/s")]}
-        for _, column in columns_here(velocity):
-            check("velocity", column, VELOCITY_UNITS, unit, allowed)
-    if time is not None and not time.unit.is_text:
-        check("time", time.column, TIME_UNITS, time.unit.value, {time.unit.value})
-    current = wanted.current
-    units = current.units([str(column) for _, column in current.places])
-    if units is not None and set(map(abs, current.stated_factors)) == {1.0}:
-        for axis, column in columns_here(current):
-            thousandth = f"m{units[axis]}"
-            check("current", column, {thousandth: thousandth}, units[axis], {units[axis]})
 
 
 def _decoded(path: Path, data: bytes) -> tuple[str, ...]:

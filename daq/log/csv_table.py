@@ -34,6 +34,8 @@ from daq.log.table import (
 from ident.arrays import FloatArray
 
 DAY_NS = 86_400 * 10**9
+FEWEST_BACK = 3  #: Steps back of a column that is no time; a restart of a clock or two is told by its row
+LARGEST_BACK_SHARE = 0.1  #: Likewise, as a share of the rows
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 _CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9})\d*)?")
 
@@ -50,6 +52,7 @@ def read_csv(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     if time is not None:
         _require_once(lines, (*columns, time.column))
         stamps, of_stamps = _stamps_of(lines, time)
+        _require_stamps(lines, time, stamps)
         remarks += tuple(f"{path.name}: {remark}" for remark in of_stamps)
         if wanted.keep is not None and wanted.keep.is_by_time:
             rows = rows_in_time(stamps, wanted.keep)
@@ -73,6 +76,32 @@ def _stamps_of(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...
             return _times_of_day(file, time)
         case _:
             return _stamps(file, time, _numbers(file, (time.column,))[:, 0])
+
+
+def _require_stamps(file: CsvLines, time: TimeColumn, stamps: Stamps) -> None:
+    """Refuse a column of another quantity, which goes back again and again, and name those that go on as time does."""
+    back = int(np.count_nonzero(np.diff(stamps.time_s) < 0.0))
+    if back < LARGEST_BACK_SHARE * len(file.rows) or back < FEWEST_BACK:
+        return
+    candidates = [str(column) for column in _increasing(file)]
+    named = f"`time`: {{column: {candidates[0]}}}" if len(candidates) == 1 else "`column` of `time`"
+    raise TableUnfit(
+        f"{file.path}, column {time.column}",
+        found=f"numbers that go back at {back} of {len(file.rows)} rows: this is no column of stamps",
+        expected=f"a column that only grows; here: {', '.join(candidates) or 'none'}",
+        remedy=f"correct {named} in the import description, or state `rate_hz` in its place",
+    )
+
+
+def _increasing(file: CsvLines) -> list[Column]:
+    """Return the columns with numbers that grow from each row to the next."""
+    fields = [file.fields(row) for row in file.rows]
+    found: list[Column] = []
+    for index in range(len(fields[0])):
+        values = np.array([file.number(row[index]) for row in fields])
+        if np.isfinite(values).all() and (np.diff(values) > 0.0).all():
+            found.append(file.names[index] if file.names else index + 1)
+    return found
 
 
 def _stamps(file: CsvLines, time: TimeColumn, values: FloatArray) -> tuple[Stamps, tuple[str, ...]]:
@@ -108,7 +137,9 @@ def _times_of_day(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, 
     stamp_ns = _texts_ns(file, time, _clock_ns, expected, remedy)
     midnight_ns = stamp_ns[0] - stamp_ns[0] % DAY_NS
     since_ns = [one - midnight_ns for one in stamp_ns]
-    time_s, remarks = without_wraps(np.array(since_ns) * 1e-9, (MIDNIGHT,))
+    has_date = max(stamp_ns) >= DAY_NS
+    wraps = () if has_date else (MIDNIGHT,)  # a date that goes back is a wrong clock, or another run
+    time_s, remarks = without_wraps(np.array(since_ns) * 1e-9, wraps)
     if remarks:
         return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
     return stamps_of_ns(since_ns), ()

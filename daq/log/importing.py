@@ -51,6 +51,7 @@ from daq.log.plausibility import (
     counting_signs,
     in_si,
     require_changing,
+    require_own_columns,
     signed_counts,
     warn_of_unsigned,
 )
@@ -109,6 +110,7 @@ def import_recording(
     cell = load_cell(path)
     wanted = with_columns(wanted, data, cell.axis_names)
     _check_cell(wanted, cell, description)
+    wanted = in_order_of_axes(wanted, cell.axis_names)
     files = _read_tables(wanted, data)
     check_sizes(wanted, cell, files)
     recorded = _recorded(wanted, cell, files)
@@ -257,6 +259,8 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     position = section_values(wanted.position, files)
     current = section_values(wanted.current, files)
     require_changing(position, current, wanted, files)
+    require_own_columns(wanted.position, position, files)
+    require_own_columns(wanted.current, current, files)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
         position, remarks = signed_counts(position, wanted)
@@ -523,6 +527,18 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 remedy="correct the unit; convert the columns of the file to it",
             )
     _payload(wanted, cell)
+
+
+def in_order_of_axes(wanted: ImportDescription, axis_names: Sequence[str]) -> ImportDescription:
+    """Return a description with units and factors in the order of the axes, where it has them by name."""
+    changed: dict[str, Section] = {}
+    units = wanted.current.units(axis_names)
+    current = wanted.current if units is None else replace(wanted.current, unit=units)
+    for key, section in (("current", current), ("torque", wanted.torque)):
+        factors = None if section is None else section.factors(axis_names)
+        if section is not None and factors is not None:
+            changed[key] = replace(section, factor=factors)
+    return wanted.model_copy(update=changed)
 
 
 def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:

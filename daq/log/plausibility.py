@@ -19,6 +19,7 @@ from daq.config.import_description import (
     PositionColumns,
     PositionUnit,
     ScaledColumns,
+    Section,
     Side,
     TemperatureColumns,
     VelocityColumns,
@@ -36,6 +37,7 @@ from ident.errors import CurrentUnsigned
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
 LARGEST_UNSIGNED = 2**32 - 1
+FEWEST_DIFFERENT = 3  #: Values of a column that is compared with others; a line at rest may be zero on two axes
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
@@ -174,6 +176,35 @@ def require_changing(
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
+
+
+def require_own_columns(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
+    """Refuse the same numbers for two axes: a copy of a column, or of a file, has the place of another one.
+
+    Args:
+        section: with the columns.
+        values: as their files have them, shape (rows, n).
+        files: the tables, by the name of their file.
+
+    Raises:
+        TableUnfit: two columns that change are equal in every row.
+    """
+    first_of: dict[bytes, int] = {}
+    for index in range(values.shape[1]):
+        column = values[:, index]
+        if np.unique(column).size < FEWEST_DIFFERENT:
+            continue
+        first = first_of.setdefault(column.tobytes(), index)
+        if first == index:
+            continue
+        earlier = section.places[first]
+        later = section.places[index]
+        raise TableUnfit(
+            f"{files[later[0]].path}, column {later[1]}",
+            found=f"the same number as column {earlier[1]} of {earlier[0]} in all {len(column)} rows",
+            expected="a column of its own for each axis: no two axes read alike to the last digit",
+            remedy="one of them is a copy: export the axis again, and correct `file` or `columns` in the description",
+        )
 
 
 def check_current(current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]) -> None:

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from daq.report.document import Report
 from daq.report.fit import Errors
-from daq.report.text import plain_table, printable, terminal_text
+from daq.report.text import origin_text, plain_table, printable, terminal_text
 from daq.workflow.full_choice import FullChoice
 from daq.workflow.mjcf_effects import JointEffects
 from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
@@ -76,8 +76,10 @@ class MjcfReport(Report):
     """`export mjcf`."""
 
     mjcf: str
-    calibration: str
-    same_configuration: bool
+    calibration: str | None
+    """name of its cell; None without one"""
+    same_configuration: bool | None
+    """whether the cell file is that of the fit; None where the calibration does not name one"""
     chosen_by: str
     """where the bodies come from"""
     exact: bool
@@ -109,7 +111,7 @@ def head_remarks(calibration: Calibration, choice: FullChoice, effects: JointEff
         effects: of it.
         software: name and version.
     """
-    yield f"By {software} from the calibration of {calibration.cell}, {calibration.created}. MuJoCo 3.3.1 or later."
+    yield f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 or later."
     yield f"Bodies: {choice.chosen_by.value}; torque changed by {choice.torque_change_percent.total:.2g} %"
     by_prior = _names_by_prior(choice)
     if by_prior:
@@ -127,7 +129,7 @@ def mjcf_report(
     source: MjcfSource,
     written: Mjcf,
     out: Path,
-    same_configuration: bool,
+    same_configuration: bool | None,
 ) -> MjcfReport:
     """Return what a model that was written holds of a calibration, and what not.
 
@@ -137,12 +139,12 @@ def mjcf_report(
         source: what the model was written from.
         written: the model.
         out: its file.
-        same_configuration: whether the cell file is that of the fit.
+        same_configuration: whether the cell file is that of the fit; None where the calibration does not name one.
     """
     return MjcfReport.of(
         choice,
         mjcf=out,
-        calibration=calibration.cell,
+        calibration=calibration.cell or None,
         same_configuration=same_configuration,
         chosen_by=choice.chosen_by.value,
         assumed_links=choice.assumed,
@@ -195,7 +197,7 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     left_out += [f"closure {name}" for name in report.closures_left_out]
     if left_out:
         yield printable(f"Not in the model: {', '.join(left_out)}.")
-    if not report.same_configuration:
+    if report.same_configuration is False:
         yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
 
 

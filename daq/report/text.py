@@ -35,6 +35,12 @@ def _spelled(character: str) -> str:
     return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
 
 
+def origin_text(cell: str, created: str) -> str:
+    """Name a calibration by its cell and date; one that a library made may have neither."""
+    of_cell = f"the calibration of {cell}" if cell else "a calibration without a name"
+    return f"{of_cell}, {created}" if created else f"{of_cell}, without a date"
+
+
 def minute_text(iso: str) -> str:
     """Write an ISO 8601 time to the minute, in UTC; any other text as it is."""
     try:

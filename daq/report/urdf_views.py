@@ -55,7 +55,8 @@ class UrdfReport(Report):
     """`export urdf`."""
 
     urdf: str
-    calibration: str
+    calibration: str | None
+    """name of its cell; None without one"""
     same_configuration: bool | None
     exact: bool
     torque_change_percent: Errors
@@ -149,7 +150,7 @@ def urdf_report(
     return UrdfReport.of(
         parameters,
         urdf=out,
-        calibration=calibration.cell,
+        calibration=calibration.cell or None,
         same_configuration=same_configuration,
         shifts=[
             ShiftedParameter.of(one, physical=one.realised, standard_deviations=one.deviations) for one in robot.shifts

@@ -12,16 +12,18 @@ torque of the fit `predict_torque` limits an effect, and a simulator does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Set
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration
 from ident.effects.effect import Effect
 from ident.effects.friction import PassiveFriction
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.effects.position import PassiveSpring, Spring
+from ident.errors import EffectNotInstalled
 from ident.model.robot import Robot
 from ident.prediction import placed_effect
 
@@ -54,8 +56,8 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
     in_geometry: list[str] = []
     left_out: list[str] = []
     for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration)
         name = f"{accepted.name} on {accepted.axis}"
+        placed, coefficients = placed_effect(accepted, calibration)
         if isinstance(placed.effect, ZeroOffset | GravityDirection):
             in_geometry.append(name)
             continue
@@ -70,6 +72,47 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
     return JointEffects(
         stiffness, spring_rest, damping, dry_friction, tuple(at_joints), tuple(in_geometry), tuple(left_out)
     )
+
+
+def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]]:
+    """Return a calibration without the effects of packages that are not installed, and a name of each of those.
+
+    A model of a simulator holds no effect of another package, so none is needed to write it.
+
+    Raises:
+        EffectRefused: the calibration holds an effect that does not exist, and names no package that had it.
+    """
+    installed: list[AcceptedEffect] = []
+    missing: list[str] = []
+    gone: set[str] = set()
+    for accepted in calibration.effects:
+        try:
+            placed_effect(accepted, calibration)
+        except EffectNotInstalled:
+            missing.append(f"{accepted.name} on {accepted.axis} (of {accepted.package}, not installed)")
+            gone |= {coefficient.name for coefficient in accepted.coefficients}
+        else:
+            installed.append(accepted)
+    kept = replace(calibration, effects=tuple(installed))
+    return _without_parameters(kept, gone), tuple(missing)
+
+
+def _without_parameters(calibration: Calibration, names: Set[str]) -> Calibration:
+    """Leave parameters out, and their rows of the covariance: those of the others stay as they are."""
+    if not names:
+        return calibration
+    is_kept = [parameter.name not in names for parameter in calibration.parameters]
+    parameters = tuple(parameter for parameter in calibration.parameters if parameter.name not in names)
+    factor = calibration.covariance_factor
+    if factor is not None:
+        lower = np.zeros((len(factor), len(factor)))
+        for number, row in enumerate(factor):
+            lower[number, : len(row)] = row
+        own = lower[[*np.ones(len(calibration.gains), dtype=np.bool_), *is_kept]]
+        # L Lᵀ of some rows is Rᵀ R of their transpose: no number has to be inverted.
+        _, upper = np.linalg.qr(own.T)
+        factor = tuple(tuple(row[: number + 1].tolist()) for number, row in enumerate(upper.T))
+    return replace(calibration, parameters=parameters, covariance_factor=factor)
 
 
 def _joint_of(place: int, robot: Robot) -> int | None:

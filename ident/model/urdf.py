@@ -280,6 +280,9 @@ def read_urdf(urdf: str) -> UrdfRobot:
     return UrdfRobot(tuple(joints), tuple(bodies), np.array(effort_limit), places)
 
 
+LONGEST_NAME = 255  #: Characters of a path in the place of a text; a longer one is not repeated in a message
+
+
 def _root(urdf: str) -> Element:
     """Return <robot>, without a namespace."""
     try:
@@ -292,7 +295,7 @@ def _root(urdf: str) -> Element:
                 "`xacro robot.urdf.xacro > robot.urdf`"
             ) from error
         text = str(urdf)
-        if "<" not in text and "\n" not in text:
+        if text.strip() and len(text) <= LONGEST_NAME and "<" not in text and "\n" not in text:
             raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")

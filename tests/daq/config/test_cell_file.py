@@ -14,6 +14,7 @@ from daq.config.cell import PacingMode, model_of
 from daq.config.cell_buses import bus_address, bus_parts, cell_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
+from daq.config.yaml_file import parse_yaml
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
 from drivers.canopen.bus import BusAddress
@@ -493,3 +494,19 @@ def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
     with pytest.raises(ConfigurationInconsistent, match=r"'f' is of type 'floating'.*`hold: \{JOINT: POSITION\}`"):
         load_cell(cell)
     assert model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:"))).robot.joint_count == 6
+
+
+@pytest.mark.parametrize("text", ["<robot name='arm'>\n<link name='a'>", "no XML " * 2000])
+def test_a_urdf_that_cannot_be_read_is_named_with_its_line_and_not_repeated(
+    checkout: Path, tmp_path: Path, text: str
+) -> None:
+    folder = tmp_path / "configs"
+    shutil.copytree(checkout / "configs", folder)
+    cell = folder / "cells/demo.yaml"
+    name = parse_yaml(cell.read_bytes(), "cell").tree["robot"]["urdf"]
+    (cell.parent / name).write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        load_cell(cell)
+    assert f"{name}: the URDF cannot be read: " in caught.value.found
+    assert "line " in caught.value.found
+    assert len(str(caught.value)) < 1500

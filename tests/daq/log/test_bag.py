@@ -20,7 +20,7 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from daq.cli import main
 from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
-from daq.log.bag_table import STAMP, read_bag
+from daq.log.bag_table import STAMP, interleaved, read_bag
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording
 from daq.log.mcap_bag import joint_state_from_cdr
@@ -229,6 +229,51 @@ def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) 
     bag = write_bag(tmp_path / "run.mcap", _with_another())
     with pytest.raises(TableUnfit, match="found messages with 6 names and 0 values of effort"):
         read(bag, publisher=2)
+
+
+@pytest.mark.parametrize("publisher", [None, 1])
+def test_positions_and_efforts_in_separate_messages_have_a_way(publisher: int | None, tmp_path: Path) -> None:
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row, effort=[])))
+        parts.append(("/joint_states", message(row, position=[])))
+    bag = write_bag(tmp_path / "run.mcap", parts)
+    with pytest.raises(TableUnfit, match="write each field to a CSV file"):
+        read(bag, publisher=publisher)
+
+
+def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
+    """A second node with the same joints, frame and fields: its stamps alone are others."""
+    stamped = [(START_NS + row * STEP_NS, message(row)) for row in range(ROWS)]
+    stamped += [(START_NS + row * STEP_NS + later_ns, message(row)) for row in range(0, ROWS, every)]
+    stamped.sort(key=lambda one: one[0])
+    parts = []
+    for stamp_ns, content in stamped:
+        seconds, nanoseconds = divmod(stamp_ns, 10**9)
+        header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
+        parts.append(("/joint_states", {**content, "header": header}))
+    return parts
+
+
+@pytest.mark.parametrize(("every", "later_ns"), [(1, 1_000_000), (1, 2_700_000), (5, 1_300_000)])
+def test_two_publishers_with_nothing_but_other_stamps_are_refused(every: int, later_ns: int, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", _alike(every, later_ns))
+    with pytest.raises(TableUnfit, match="stamps of two publishers") as caught:
+        read(bag)
+    assert f"{ROWS} messages each 0.004 s" in caught.value.found
+    assert f"{ROWS // every} messages each {0.004 * every:g} s" in caught.value.found
+    assert "`frame_id`" in caught.value.remedy
+
+
+@pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])
+def test_uneven_stamps_of_one_publisher_are_not_two(jitter: float) -> None:
+    random = np.random.default_rng(3)
+    time_s = 0.004 * (np.arange(3000) + jitter * random.uniform(-1.0, 1.0, 3000))
+    assert interleaved(time_s) is None
+    in_turn_s = 0.004 * (np.arange(3000) + jitter * 0.4 * (np.arange(3000) % 2))
+    assert interleaved(in_turn_s) is None
+    lost = np.delete(time_s, random.integers(0, 3000, 200))
+    assert interleaved(lost) is None
 
 
 def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:

@@ -45,15 +45,16 @@ def _read(
     velocity: VelocityUnit | None = None,
     keep: KeptPart | None = None,
     end: str = "\n",
+    stamps: str = "t",
     **layout: Any,
 ) -> Table:
     """Read position and current, and the stamps of column `t`."""
     path = folder / "run.csv"
     path.write_text("\n".join(lines) + end, encoding="utf-8")
-    stamps = None if time is None else TimeColumn(file="run.csv", column="t", unit=time)
+    timed = None if time is None else TimeColumn(file="run.csv", column=stamps, unit=time)
     moved = None
     if velocity is not None:
-        moved = VelocityColumns(file="run.csv", columns=columns[:1], unit=velocity, side=Side.JOINT)
+        moved = VelocityColumns(file="run.csv", columns=("v",), unit=velocity, side=Side.JOINT)
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
@@ -61,11 +62,11 @@ def _read(
         position=PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT),
         current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor),
         velocity=moved,
-        time=stamps,
+        time=timed,
         rate_hz=None if time is not None else 100.0,
         keep=keep,
     )
-    return read_csv(path, wanted, columns, stamps)
+    return read_csv(path, wanted, columns, timed)
 
 
 @pytest.mark.parametrize("units", ["s,rad,A", "[s],[rad],[A]", "(s), (rad), (A)", "sec,rad,", "s,m,A"])
@@ -87,7 +88,14 @@ def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) 
         ("s,rad,A", {"unit": PositionUnit.DEG}, "unit 'rad' in the line", "'deg'"),
         ("ms,rad,A", {}, "unit 'ms' in the line", "'s', the unit of `time`"),
         ("s,rad,mA", {}, "unit 'mA' in the line", "'A', the unit of `current`"),
-        ("s,deg/s,A", {"velocity": VelocityUnit.RAD}, "unit 'deg/s' in the line", "'rad/s', the unit of `velocity`"),
+        ("s,rad,Nm", {}, "unit 'Nm' in the line", "'A', the unit of `current`"),
+        ("s,rad,%", {}, "unit '%' in the line", "'A'"),
+        ("s,rad,[V]", {}, "unit 'V' in the line", "'A'"),
+        ("s,rad,A", {"factor": 0.001}, "unit 'A' in the line", "with the factor 0.001"),
+        ("s,rad,mA", {"factor": 1000.0}, "unit 'mA' in the line", "with the factor 1000"),
+        ("s,counts,A", {}, "unit 'counts' in the line", "'rad'"),
+        ("s,RAD,A", {"unit": PositionUnit.COUNTS}, "unit 'RAD' in the line", "'counts'"),
+        ("s,rad/s,A", {}, "unit 'rad/s' in the line", "'rad'"),
     ],
 )
 def test_units_that_contradict_the_description_are_refused(
@@ -97,6 +105,59 @@ def test_units_that_contradict_the_description_are_refused(
         _read(tmp_path, ["t,q,i", units, *ROWS], **changes)
     assert found in caught.value.found
     assert expected in caught.value.expected
+
+
+@pytest.mark.parametrize(
+    ("names", "column"), [("t,q [deg],i", "q [deg]"), ("t [ms],q,i [A]", "t [ms]"), ("t,q,i [mA]", "i [mA]")]
+)
+def test_a_unit_in_the_name_of_a_column_is_compared_too(tmp_path: Path, names: str, column: str) -> None:
+    stamps, position, current = names.split(",")
+    with pytest.raises(TableUnfit, match=r"run\.csv:1") as caught:
+        _read(tmp_path, [names, *ROWS], columns=(position, current), stamps=stamps)
+    assert column in caught.value.subject
+    assert "in the name of the column" in caught.value.found
+
+
+@pytest.mark.parametrize("unit", ["deg/s", "rpm", "mm/s"])
+def test_velocities_in_another_unit_are_refused(tmp_path: Path, unit: str) -> None:
+    rows = [f"{row},0.5" for row in ROWS]
+    with pytest.raises(TableUnfit, match=r"run\.csv:2, column v") as caught:
+        _read(tmp_path, ["t,q,i,v", f"s,rad,A,{unit}", *rows], velocity=VelocityUnit.RAD)
+    assert "'rad/s', the unit of `velocity`" in caught.value.expected
+
+
+def test_letters_in_a_name_that_may_be_no_unit_say_nothing(tmp_path: Path) -> None:
+    names = ("q [A]", "i [N]")
+    assert len(_read(tmp_path, ["t,q [A],i [N]", *ROWS], columns=names).values) == COUNT
+
+
+@pytest.mark.parametrize(("units", "factor"), [("s,rad,Nm", 0.5), ("s,rad,%", 0.12), ("s,rad,A", 1.414)])
+def test_a_factor_may_convert_another_quantity(tmp_path: Path, units: str, factor: float) -> None:
+    assert len(_read(tmp_path, ["t,q,i", units, *ROWS], factor=factor).values) == COUNT
+
+
+def test_a_unit_that_is_not_known_says_nothing(tmp_path: Path) -> None:
+    assert len(_read(tmp_path, ["t,q,i", "s,turns,A", *ROWS]).values) == COUNT
+
+
+def test_a_row_that_is_commented_out_is_missing_at_a_rate(tmp_path: Path) -> None:
+    lines = ["t,q,i", *ROWS]
+    lines[5] = f"# {lines[5]}"
+    with pytest.raises(TableUnfit, match=r"run\.csv:6") as caught:
+        _read(tmp_path, lines, time=None, comment="#")
+    assert "commented out" in caught.value.found
+    assert len(_read(tmp_path, lines, comment="#").values) == COUNT - 1
+    lines[5] = "# 12 rows"
+    assert len(_read(tmp_path, lines, time=None, comment="#").values) == COUNT - 1
+
+
+def test_a_column_that_is_no_time_names_those_that_grow(tmp_path: Path) -> None:
+    lines = ["clock,t,i", *ROWS]
+    with pytest.raises(TableUnfit, match="column t") as caught:
+        _read(tmp_path, lines, columns=("clock", "i"))
+    assert "go back" in caught.value.found
+    assert "here: clock" in caught.value.expected
+    assert "`time`: {column: clock}" in caught.value.remedy
 
 
 def test_a_factor_explains_another_unit_of_the_current(tmp_path: Path) -> None:
@@ -136,7 +197,7 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
     lines = ["t,#q,i", *ROWS]
     np.testing.assert_array_equal(_read(tmp_path, lines, columns=("#q", "i")).values, READ)
     lines = ["#q,t,i", *ROWS]
-    table = _read(tmp_path, lines, columns=("#q", "i"))
+    table = _read(tmp_path, lines, columns=("#q", "i"), time=None)
     np.testing.assert_array_equal(table.values[:, 0], np.round(VALUES[:, 0], 6))
 
 

@@ -37,7 +37,7 @@ def _read(
         name="run",
         cell="cell.yaml",
         table=CsvLayout(**layout),
-        position=PositionColumns(file="run.csv", columns=columns[:1], unit=PositionUnit.RAD, side=Side.JOINT),
+        position=PositionColumns(file="run.csv", columns=columns[:1], unit=PositionUnit.DEG, side=Side.JOINT),
         current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A"),
     )
     return read_csv(path, wanted, columns, None if time is None else TimeColumn(file="run.csv", column=1, unit=time))
@@ -265,6 +265,14 @@ def test_times_of_day_go_on_over_midnight(tmp_path: Path) -> None:
     assert table.stamps is not None
     assert table.stamps.time_s == pytest.approx([0.0, 0.01, 0.02, 0.03], abs=1e-9)
     assert "times of day that pass midnight" in table.remarks[0]
+
+
+def test_dates_that_go_back_a_day_do_not_pass_midnight(tmp_path: Path) -> None:
+    texts = ["2026-03-02 23:59:59.98", "2026-03-02 23:59:59.99", "2026-03-02 00:00:00.00", "2026-03-02 00:00:00.01"]
+    table = _stamped(tmp_path, TimeUnit.CLOCK, texts)
+    assert table.stamps is not None
+    assert np.diff(table.stamps.time_s).min() < -86_000.0
+    assert table.remarks == ()
 
 
 @pytest.mark.parametrize("text", ["8:59 AM", "24:00:00", "08:59", "2026-02-30 08:00:00", "08:60:00", "5.0"])

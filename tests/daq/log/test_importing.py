@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
+from daq.config.cell_file import load_cell
 from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, TableUnfit, UsageError
@@ -204,6 +205,35 @@ def test_a_field_that_is_no_finite_number(bench: Bench, capsys: pytest.CaptureFi
     fields[8] = word
     bench.spoil_csv(rows[41], ",".join(fields))
     _refused(bench, capsys, 4, "run.csv:42, column i3", repr(word), "a finite number")
+
+
+@pytest.mark.parametrize(("copied", "original"), [(3, 1), (10, 7)])
+def test_two_axes_with_the_same_numbers_are_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], copied: int, original: int
+) -> None:
+    values = np.hstack((bench.joint_deg, bench.current_a))
+    values[:, copied] = values[:, original]
+    bench.write_csv(values)
+    _refused(bench, capsys, 4, f"column {NAMES[copied]}", f"the same number as column {NAMES[original]} of run.csv")
+
+
+def test_a_copy_of_a_file_is_no_other_axis(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    _file_of_each_axis(bench)
+    first = sorted(bench.data.glob("*1.csv"))[0]
+    second = sorted(bench.data.glob("*2.csv"))[0]
+    second.write_bytes(first.read_bytes())
+    _refused(bench, capsys, 4, second.name, f"of {first.name} in all")
+
+
+def test_units_by_the_name_of_an_axis_are_compared_with_the_file(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units = ["deg"] * 6 + ["A"] * 5 + ["mA"]
+    header = ",".join(NAMES)
+    bench.spoil_csv(header, header + "\n" + ",".join(units))
+    of_axes = dict.fromkeys(load_cell(bench.folder / "configs/cells/demo.yaml").axis_names, "A")
+    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": of_axes})
+    _refused(bench, capsys, 4, f"column {NAMES[11]}", "unit 'mA' in the line of units", "'A'")
 
 
 def test_a_missing_file(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import daq.environment
 from daq.cli.app import main
+from daq.workflow.mjcf_effects import split_installed
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.model.closures import origin
 from ident.model.robot import poses
@@ -327,6 +328,45 @@ def test_effects_are_listed_and_exactly_they_are_missing(tmp_path: Path, capsys:
     assert np.abs(of_effect).max() > 1.0
     whole = inverse_nm(exported.text, robot) + exported.missing_nm + of_effect
     assert apart(whole[:, moving], robot.predicted_nm(calibration)[:, moving]) <= SAME
+
+
+def test_an_effect_that_is_not_installed_is_listed_with_its_package(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = robot_of("seven-axis")
+    coefficient = Parameter("ring-friction coefficient 1", 0.1, 0.01, "Nm")
+    effect = AcceptedEffect("ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0")
+    exported = export(robot, tmp_path, capsys, robot.with_effect(effect))
+    assert exported.report["effects_left_out"] == ["ring-friction on J3 (of ring-effect 1.2.0, not installed)"]
+    assert "Effects NOT in this model: ring-friction on J3 (of ring-effect 1.2.0" in exported.text
+
+
+def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None:
+    robot = robot_of("seven-axis")
+    coefficient = Parameter("ring-friction coefficient 1", 0.1, 0.01, "Nm")
+    effect = AcceptedEffect("ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0")
+    known = robot.with_effect(effect)
+    known = replace(known, parameters=(known.parameters[-1], *known.parameters[:-1]))
+    size = len(known.gains) + len(known.parameters)
+    factor = np.tril(np.random.default_rng(1).normal(size=(size, size)))
+    rows = tuple(tuple(row[: number + 1].tolist()) for number, row in enumerate(factor))
+    without, _ = split_installed(replace(known, covariance_factor=rows))
+    left = np.delete(np.arange(size), len(known.gains))
+    assert without.parameters == known.parameters[1:]
+    assert without.covariance is not None
+    np.testing.assert_allclose(without.covariance, (factor @ factor.T)[np.ix_(left, left)], atol=1e-12)
+
+
+def test_a_calibration_of_a_library_has_neither_date_nor_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = robot_of("seven-axis")
+    calibration = replace(robot.calibration, created="", software="", configuration_sha256="")
+    exported = export(robot, tmp_path, capsys, calibration)
+    assert f"from the calibration of {calibration.cell}, without a date. " in exported.text
+    assert exported.report["same_configuration"] is None
+    other = export(robot, tmp_path, capsys, replace(calibration, configuration_sha256="0" * 64))
+    assert other.report["same_configuration"] is False
 
 
 def test_springs_and_friction_of_passive_joints_are_at_their_joints(
