@@ -37,7 +37,7 @@ from ident.discovery.late_currents import (
 from ident.discovery.pairs_of_zeros import PairOfZeros, pairs_that_pass, try_pairs
 from ident.discovery.search import Finding, rank_families
 from ident.effects.dictionary import GEOMETRY
-from ident.effects.effect import Effect, PlacedEffect, effect_torque, is_placeable
+from ident.effects.effect import Effect, PlacedEffect, effect_torque, fits_data, is_placeable
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.geometry_corrections import (
     GeometryEffect,
@@ -605,7 +605,7 @@ def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tup
         fitting: list[tuple[Effect, ...]] = []
         for family in families:
             members = tuple(one for one in family if is_placeable(one, axis, problem.model.robot))
-            fitting.append(tuple(one for one in members if one.fits_in(problem.rows, axis)))
+            fitting.append(tuple(one for one in members if fits_data(one, problem.rows, axis)))
         tested += problem.test([family for family in fitting if family], axis, at_rows=True)
     return tuple(tested)
 

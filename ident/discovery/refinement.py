@@ -13,11 +13,11 @@ import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem
-from ident.effects.effect import Effect, setting_range
+from ident.effects.effect import Effect, is_shipped, setting_range
 
 MOST_TRIALS = 80  #: Of settings, in one refinement
-FIRST_STEP = 0.15  #: Of the simplex: rad of an angle, or of a ratio
-CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops
+FIRST_STEP = 0.15  #: Of the simplex, in the unit of each setting
+CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops, in its unit
 DIGITS = 4  #: Of a setting, as a calibration shows it
 
 
@@ -50,12 +50,24 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
         return -float(trial.fallen.sum()) if trial is not None and is_strictly_possible(effect, trial) else 0.0
 
     start = np.array([effect.settings[name] for name in names])
-    simplex = start + np.vstack((np.zeros(len(names)), FIRST_STEP * np.eye(len(names))))
+    unit = _units(effect, start)
+    simplex = start + np.vstack((np.zeros(len(names)), FIRST_STEP * np.diag(unit)))
     simplex[:, :] = np.clip(simplex, [one.least for one in ranges], [one.largest for one in ranges])
+
+    def cost_in_units(values: FloatArray) -> float:
+        return cost(values * unit)
+
     found = scipy.optimize.minimize(
-        cost,
-        start,
+        cost_in_units,
+        start / unit,
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": MOST_TRIALS, "xatol": CLOSE_ENOUGH, "fatol": 0.1},
+        options={"initial_simplex": simplex / unit, "maxfev": MOST_TRIALS, "xatol": CLOSE_ENOUGH, "fatol": 0.1},
     )
-    return changed(found.x) if found.fun < cost(start) else effect
+    return changed(found.x * unit) if found.fun < cost(start) else effect
+
+
+def _units(effect: Effect, start: FloatArray) -> FloatArray:
+    """Unit in which each setting is changed: 1 rad or a ratio of 1 in the dictionary, else the size of its value."""
+    if is_shipped(effect):
+        return np.ones(len(start))
+    return np.where(start == 0.0, 1.0, np.abs(start))

@@ -35,7 +35,7 @@ from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProbl
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, certain_delays, impossible
 from ident.discovery.refinement import refine_together
-from ident.effects.effect import FORMS, Effect, PlacedEffect, is_placeable
+from ident.effects.effect import FORMS, Effect, PlacedEffect, fits_data, is_placeable
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
 from ident.effects.own import search_families
 from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
@@ -123,7 +123,7 @@ def _is_tried(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
     """Whether an effect can be on an axis, and these data can show it there."""
     if not is_placeable(effect, axis, search_problem.model.robot):
         return False
-    return effect.least_moves <= search_problem.folds.moves and effect.fits_in(search_problem.runs, axis)
+    return effect.least_moves <= search_problem.folds.moves and fits_data(effect, search_problem.runs, axis)
 
 
 def rank_families(

@@ -153,8 +153,14 @@ class Effect(ABC):
 
     @property
     def refined(self) -> tuple[str, ...]:
-        """Settings that are fitted together with the whole model; those of the dictionary are only where to begin."""
-        return ()
+        """Settings that are fitted together with the whole model; the values that a family has are where to begin.
+
+        Of an effect of one's own, all real settings where it has two or more: kept at a value that somebody gave, they
+        would leave a rest that other effects explain, and σ would not know it. A single one is refined between its
+        neighbours in the family. An empty tuple leaves them as they are given.
+        """
+        real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
+        return real if len(real) > 1 and not is_shipped(self) else ()
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
@@ -341,6 +347,23 @@ def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
     if axis < count:
         return columns
     return np.asarray(signals.leverage[axis - count][:, None] * columns)
+
+
+def fits_data(effect: Effect, runs: Sequence[Signals], axis: int) -> bool:
+    """Whether the data can show an effect on an axis (`Effect.fits_in`).
+
+    Raises:
+        EffectRefused: an effect of one's own fails.
+    """
+    if is_shipped(effect):
+        return effect.fits_in(runs, axis)
+    try:
+        return bool(effect.fits_in(runs, axis))
+    except (Exception, SystemExit) as error:  # code of others
+        raise EffectRefused(
+            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `fits_in`; expected True or "
+            "False; correct it"
+        ) from error
 
 
 _SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}

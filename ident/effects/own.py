@@ -19,7 +19,7 @@ from importlib.metadata import EntryPoint, entry_points, packages_distributions,
 from itertools import chain
 
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
-from ident.effects.effect import Effect, is_shipped
+from ident.effects.effect import Effect, is_shipped, setting_range
 from ident.errors import EffectRefused
 
 ENTRY_POINT_GROUP = "drivegain.effects"
@@ -111,6 +111,8 @@ def families_of(effects: Iterable[object], where: str) -> tuple[Family, ...]:
     Raises:
         EffectRefused: one is not an effect, has a name that cannot be used, or a field that no calibration would keep.
     """
+    if isinstance(effects, Effect) or not isinstance(effects, Iterable):
+        raise EffectRefused(f"{where}: found {effects!r:.80}; expected a list of effects; put brackets around it")
     families: dict[str, list[Effect]] = {}
     for effect in effects:
         if not isinstance(effect, Effect):
@@ -176,6 +178,22 @@ def _check(effect: Effect, where: str) -> None:
             f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; expected each as "
             "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
         )
+    for setting, value in effect.settings.items():
+        allowed = setting_range(effect, setting)
+        if not allowed.least <= value <= allowed.largest:
+            raise EffectRefused(
+                f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from {allowed.least:g} to "
+                f"{allowed.largest:g}, as its range says; correct one of both"
+            )
+    unknown = sorted(set(effect.refined_once_chosen) - kept)
+    if unknown:
+        raise EffectRefused(
+            f"{where}: found {', '.join(unknown)} in `refined` of effect {name!r}; expected names among its settings: "
+            f"{', '.join(sorted(kept)) or 'it has none'}"
+        )
+    coefficients = [column.name for column in effect.coefficients]
+    if len(set(coefficients)) < len(coefficients):
+        raise EffectRefused(f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for each")
     unfit = [column.name for column in effect.coefficients if ":" in column.name or not column.name]
     if unfit or not effect.coefficients:
         raise EffectRefused(

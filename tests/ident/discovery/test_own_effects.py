@@ -73,6 +73,60 @@ def test_it_is_not_found_where_it_is_not(small: Evidence) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class TightSpot(ident.Effect):
+    """τ = a sign(q̇) exp(−((q − c)/w)²): friction where something rubs."""
+
+    name = "tight-spot"
+    declares = ident.Property.ODD_IN_VELOCITY
+    abscissa = ident.Abscissa.POSITION
+    coefficients = (ident.Column("friction", "Nm", least=0.0),)
+
+    centre_rad: Annotated[float, ident.Range(-4.0, 4.0)]  #: c
+    width_rad: Annotated[float, ident.Range(0.02, 3.0)]  #: w
+
+    def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        distance = (signals.position_rad[axis] - self.centre_rad) / self.width_rad
+        return np.asarray(np.sign(signals.velocity_rad_s[axis]) * np.exp(-(distance**2)))[None]
+
+
+@dataclass(frozen=True, slots=True)
+class StayingSpot(TightSpot):
+    """The same, whose settings stay as they are given."""
+
+    name = "staying-spot"
+    refined = ()
+
+
+CENTRE_RAD = 0.4
+WIDTH_RAD = 0.45
+SPOT_NM = 12.0
+
+
+def _rubbing(data: Dataset) -> FloatArray:
+    distance = (data.position_rad[:, 1] - CENTRE_RAD) / WIDTH_RAD
+    return acting_on(1, 3, SPOT_NM * np.exp(-(distance**2)) * np.sign(data.velocity_rad_s[:, 1]))
+
+
+def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(small: Evidence, small_truth: Truth) -> None:
+    """At the values that are given, a rest would stay, and be taken for another friction."""
+    given = tuple(TightSpot(centre_rad, 0.8) for centre_rad in (-1.0, 0.0, 1.0))
+    steps = find_effects(bent(small, small_truth, _rubbing), np.random.default_rng(0), GATES, own_effects=given)
+    (placed,) = steps[-1].after.effects
+    assert isinstance(placed.effect, TightSpot)
+    assert placed.axis == 1
+    assert placed.effect.centre_rad == pytest.approx(CENTRE_RAD, abs=0.05)
+    assert placed.effect.width_rad == pytest.approx(WIDTH_RAD, abs=0.05)
+
+
+def test_which_settings_are_refined_is_for_the_class_to_say() -> None:
+    assert TightSpot(0.0, 0.8).refined == ("centre_rad", "width_rad")
+    assert TightSpot(0.0, 0.8).refined_once_chosen == ("centre_rad", "width_rad")
+    assert StayingSpot(0.0, 0.8).refined == ()
+    assert LobedFriction(2.0).refined == ()  # one alone is refined between its neighbours
+
+
+@dataclass(frozen=True, slots=True)
 class WritingFriction(LobedFriction):
     """The same, which changes the positions of everybody."""
 

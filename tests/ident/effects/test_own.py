@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ import pytest
 import ident
 from ident.arrays import FloatArray
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import columns_at
+from ident.effects.effect import columns_at, fits_data
 from ident.effects.own import families_of, installed_families, known_effect, package_of, search_families
 from ident.effects.signals import Signals
 
@@ -74,9 +74,31 @@ class Colon(SquareDrag):
     coefficients = (ident.Column("drag:disc", "Nm"),)
 
 
+@dataclass(frozen=True, slots=True)
+class Twice(SquareDrag):
+    """Two coefficients of one name."""
+
+    name = "twice-drag"
+    coefficients = (ident.Column("drag", "Nm"), ident.Column("drag", "Nm"))  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, slots=True)
+class Misspelled(SquareDrag):
+    """A setting to refine that there is not."""
+
+    name = "misspelled-drag"
+    refined = ("exponents",)
+
+
 @pytest.mark.parametrize(
     ("effects", "words"),
     [
+        (SquareDrag(), r"SquareDrag\(exponent=1.0\); expected a list of effects; put brackets around it"),
+        (None, r"None; expected a list of effects"),
+        ([SquareDrag(7.0)], r"exponent = 7 in effect 'square-drag'; expected a value from 0.5 to 3"),
+        ([SquareDrag(float("nan"))], r"exponent = nan in effect 'square-drag'; expected a value"),
+        ([Twice()], r"coefficients \['drag', 'drag'\] of effect 'twice-drag'; expected a name for each"),
+        ([Misspelled()], r"exponents in `refined` of effect 'misspelled-drag'; expected names among its .*: exponent"),
         ([SquareDrag], r"the class SquareDrag; expected objects of subclasses of `ident.Effect`"),
         (["spring"], r"'spring'; expected objects"),
         ([Named()], r"the name 'Square Drag'; expected lowercase words joined by hyphens"),
@@ -86,7 +108,7 @@ class Colon(SquareDrag):
         ([Colon()], r"coefficients \['drag:disc'\] of effect 'colon-drag'; expected at least one, with a name"),
     ],
 )
-def test_what_is_no_usable_effect_is_refused(effects: list[object], words: str) -> None:
+def test_what_is_no_usable_effect_is_refused(effects: Any, words: str) -> None:
     with pytest.raises(ident.EffectRefused, match=rf"^`own_effects`: found .*{words}"):
         families_of(effects, "`own_effects`")
 
@@ -148,6 +170,25 @@ def test_an_effect_of_ones_own_that_fails_is_refused_by_name(error: int, words: 
     stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
     with pytest.raises(ident.EffectRefused, match=rf"effect 'failing': found {words}"):
         columns_at(Failing(error=error), cast(Signals, stub), 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Hesitating(SquareDrag):
+    """One that cannot say whether the data show it."""
+
+    name = "hesitating"
+
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
+        """Fail."""
+        raise IndexError(f"{len(runs)} runs, axis {axis}")
+
+
+def test_an_effect_that_cannot_say_whether_it_fits_is_refused_by_name() -> None:
+    assert fits_data(SquareDrag(), (), 0)
+    with pytest.raises(
+        ident.EffectRefused, match=r"'hesitating': found IndexError \(0 runs, axis 1\) in its .*fits_in"
+    ):
+        fits_data(Hesitating(), (), 1)
 
 
 class Site:
