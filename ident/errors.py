@@ -214,15 +214,19 @@ class PlanUnfit(IdentificationError):
 class NotConverged(IdentificationError):
     """The iteration did not reach its optimum."""
 
-    def __init__(self, method: str, iterations: int, cost: tuple[float, ...], step: float) -> None:
+    def __init__(
+        self, method: str, iterations: int, cost: tuple[float, ...], step: float, likely_cause: str = ""
+    ) -> None:
+        question = likely_cause or "are roles, payload mass, drive train, rad and axis order ok?"
         super().__init__(
             f"{method} did not converge in {iterations} iterations: the cost went from {cost[0]:.6g} to {cost[-1]:.6g} "
-            f"and the last relative step was {step:.2g}; are roles, payload mass, drive train, rad and axis order ok?"
+            f"and the last relative step was {step:.2g}; {question}"
         )
         self.method = method
         self.iterations = iterations
         self.cost = cost
         self.step = step
+        self.likely_cause = likely_cause  #: found in the recordings; empty where nothing in them is odd
 
 
 class EffectRefused(IdentificationError):

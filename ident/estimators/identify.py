@@ -34,6 +34,7 @@ from ident.estimators.refusals import (
     require_signs,
     require_weight,
     with_channel_causes,
+    with_unit_causes,
 )
 from ident.model.bodies import Payload
 from ident.model.model import Model
@@ -100,7 +101,7 @@ def identify(
     require_moved(standard, axes)
     system = regrouped(standard)
     del standard  # its clusters hold every column
-    with with_channel_causes(channels, axes):
+    with with_unit_causes(channels, model, axes), with_channel_causes(channels, axes):
         require_distinct(system, gains=known_gains is None)
         estimate = estimate_with(method, system, known_gains)
         jackknifed = estimate

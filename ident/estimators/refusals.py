@@ -30,6 +30,7 @@ from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import wls
 from ident.estimators.payload_diagnosis import likeliest_masses, payload_differences
 from ident.model.model import Model
+from ident.model.robot import JointKind
 from ident.plausible import GAIN_RANGE, LARGEST_GAIN_STD, UNIT_RATIO, range_text
 
 LEAST_WEIGHT = 1e-3
@@ -48,6 +49,8 @@ EXCHANGE = 0.4
 LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
 SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
 FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
+WIDEST_RANGE_RAD = 8.0 * np.pi  #: No arm's joint turns four times: cables go through it
+LARGEST_CURRENT_A = 1000.0  #: A servo amplifier of a robot gives a tenth of it
 FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
 WEIGHT_SIGMAS = 30.0  #: Likewise, for the weight of a payload
 
@@ -106,6 +109,52 @@ def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Ite
         if still is None:
             raise
         raise still from error
+
+
+@contextmanager
+def with_unit_causes(runs: Sequence[RunChannels], model: Model, axes: Sequence[str]) -> Iterator[None]:
+    """Say where a fit does not settle, or sees no payload, that the recordings seem to be in other units.
+
+    Args:
+        runs: of the fit.
+        model: of the robot, for the kinds of its joints.
+        axes: name of each axis.
+
+    Raises:
+        NotConverged, PayloadUnseen: with the likely cause.
+    """
+    try:
+        yield
+    except NotConverged as error:
+        cause = unlikely_units(runs, model, axes)
+        if not cause:
+            raise
+        raise NotConverged(error.method, error.iterations, error.cost, error.step, cause) from error
+    except PayloadUnseen as error:
+        cause = unlikely_units(runs, model, axes)
+        if not cause:
+            raise
+        raise PayloadUnseen(error.std_percent, error.runs, cause) from error
+
+
+def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str]) -> str:
+    """Say that angles or currents are larger than those of robots; empty where none is."""
+    is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in model.robot.axes])
+    for run in runs:
+        turned_rad = np.where(is_revolute, run.range, 0.0)
+        widest = int(np.argmax(turned_rad))
+        if turned_rad[widest] > WIDEST_RANGE_RAD:
+            return (
+                f"found {axes[widest]} turning by {turned_rad[widest]:.4g} rad in run {run.run!r}; expected a joint's "
+                "angle in rad: are these degrees, counts, or the motor's angle before the gear?"
+            )
+        largest = int(np.argmax(run.limits))
+        if run.limits[largest] > LARGEST_CURRENT_A:
+            return (
+                f"found a current of {run.limits[largest]:.4g} A of {axes[largest]} in run {run.run!r}; expected "
+                "amperes: are these milliamperes, or thousandths of the rated current?"
+            )
+    return ""
 
 
 # The payload and the roles of the runs

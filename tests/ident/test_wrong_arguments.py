@@ -13,6 +13,10 @@ import numpy as np
 import pytest
 
 import ident
+from ident.arrays import FloatArray
+from ident.data.dataset import differentiate
+from ident.data.run_channels import channels_of
+from ident.estimators.refusals import unlikely_units
 from tests.ident.arms import THREE_AXES
 from tests.ident.recordings import MOUNTED, Truth, record
 
@@ -81,6 +85,33 @@ def test_a_run_that_is_none_is_refused(
 ) -> None:
     with pytest.raises(ident.IdentificationError, match=words):
         ident.identify(small_truth.model, [change(short[0]), short[1]], ident.Conditioning())
+
+
+IN_OTHER_UNITS: list[tuple[str, FloatArray]] = [
+    ("degrees", np.full(3, 180.0 / np.pi)),
+    ("degrees of one axis", np.array([1.0, 180.0 / np.pi, 1.0])),
+    ("angles of the motors", np.array([40.0, 50.0, -45.0])),
+]
+
+
+@pytest.mark.parametrize("factors", [case[1] for case in IN_OTHER_UNITS], ids=[case[0] for case in IN_OTHER_UNITS])
+def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], factors: FloatArray
+) -> None:
+    runs = [replace(run, position_rad=np.asarray(run.position_rad) * factors) for run in short]
+    words = r"found q\d turning by \d+\.?\d* rad in run '\w+'; expected a joint's angle in rad: are these degrees"
+    with pytest.raises(ident.IdentificationError, match=words):
+        ident.identify(small_truth.model, runs)
+
+
+def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run]
+) -> None:
+    channels = [channels_of(small_truth.model, differentiate(run, small_truth.model.drive_train)) for run in short]
+    axes = ("J1", "J2", "J3")
+    assert unlikely_units(channels, small_truth.model, axes) == ""
+    in_milliamperes = [replace(one, limits=1000.0 * one.limits) for one in channels]
+    assert "are these milliamperes" in unlikely_units(in_milliamperes, small_truth.model, axes)
 
 
 Call = Callable[[Any, Any], Any]
