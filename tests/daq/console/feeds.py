@@ -99,9 +99,10 @@ class WatchedLive(Live):
         super().__init__(cell_file, cell)
 
     def take(self, packet: bytes) -> None:
-        """Take a packet."""
-        super().take(packet)
-        self._notify()
+        """Take a packet as a whole: whoever waits never sees a half of what it changes."""
+        with self.changed:
+            super().take(packet)
+            self._notify()
 
     def _clear(self, phase: str, run: RunFacts | None) -> None:
         super()._clear(phase, run)
