@@ -107,7 +107,7 @@ def history_verb(
         checked, history, all_series = _read(ledger, verify)
     if checked is None and history.may_lack:
         _LOG.warning(MAY_LACK)
-    _say_names(history, cell)
+    _say_names(history if rename is None else replace(history, possible_names=()), cell)
     chosen = all_series if axis is None else (_named(all_series, axis, declared),)
     _write_files(chosen, declared, plot, csv)
     current = in_force(declared, history)
@@ -324,7 +324,14 @@ def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, 
             return
         rename_cell(ledger, planned, who=who, at=now)
         rename_sessions(folders, old, cell.name, until)
-    say(f"Renamed {old!r} to {cell.name!r}: {taken}.", err=True)
+    if planned.entered_at is None:
+        say(f"Renamed {old!r} to {cell.name!r}: {taken}.", err=True)
+    else:
+        say(
+            f"{old!r} was renamed to {cell.name!r} on {planned.entered_at:%Y-%m-%d}; {counted(count, 'session')} taken "
+            "over now.",
+            err=True,
+        )
     say(
         "Logs, plans and calibration files keep the old name: make new ones. A schedule of the old name "
         f"({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: drivegain schedule.",

@@ -296,8 +296,6 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     A write without an end counts where a later entry shows that it was made: the next write found its content, or a
     process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
     """
-    as_written = entries
-    entries = with_present_names(as_written)
     events = _events(writes_to(cell, entries, witnessed_writes(entries), everywhere=True))
     by_digest: dict[str | None, list[Event]] = {}
     for event in events:
@@ -340,7 +338,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         acceptances=acceptances,
         unreadable=tuple(unreadable),
         other_robots=tuple(foreign),
-        renamed=_rename_of_robot(as_written, cell.name, robot),
+        renamed=_rename_of_robot(entries, cell.name, robot),
         possible_names=() if calibrations else _names_of_robot(entries, robot),
     )
 
@@ -372,7 +370,7 @@ def _rename_of_robot(entries: Iterable[AuditEntry], name: str, robot: Calibrated
 def _names_of_robot(entries: Sequence[AuditEntry], robot: CalibratedRobot) -> tuple[str, ...]:
     """Return the names in an audit log under which every calibration is of a robot that looks the same."""
     names = []
-    for name in names_in(entries):
+    for name in names_in(with_present_names(entries)):
         robots = []
         for one in entered_calibrations(entries, name):
             try:

@@ -54,7 +54,7 @@ from daq.ledger.migration import (
     read_stored,
     set_aside,
 )
-from daq.ledger.names import cell_names, former_names, rename_of, with_present_names
+from daq.ledger.names import cell_names, former_names, rename_of, renames_to, with_present_names
 from ident.calibration import Calibration
 
 _LOG = logging.getLogger("drivegain")
@@ -360,11 +360,11 @@ def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetim
 
 
 def _entered_rename_at(entries: Sequence[AuditEntry], old: str, new: str) -> datetime | None:
-    """Return when a cell got its present name, by the entry of its first or its last rename."""
+    """Return when a cell gave up a name that it had before its present one; None where the entry has no time."""
+    own = [rename for rename in renames_to(entries, new) if rename.old == old]
     found = None
     for one in entries:
-        rename = rename_of(one)
-        if rename is not None and (rename.old == old or rename.new == new):
+        if rename_of(one) in own:
             found = at_of(one) or found
     return found
 

@@ -1,7 +1,8 @@
 """Names of cells in an audit log: a rename is an entry, and counts for the entries before it.
 
 Nothing in the log is rewritten. Whoever folds the log reads it under the names that its cells have now
-(`with_present_names`). What is entered later under the old name is of another cell.
+(`with_present_names`, once: a name that a rename has freed may be another cell's by now). What is entered later under
+the old name is of another cell.
 """
 
 from __future__ import annotations
@@ -66,14 +67,23 @@ def _under_present_name(one: AuditEntry, present: Mapping[str, str]) -> AuditEnt
     return replace(one, details=details, subject=subjects.get(one.subject, one.subject))
 
 
-def former_names(entries: Sequence[AuditEntry], cell: str) -> frozenset[str]:
-    """Return the names that a cell had before."""
-    names: set[str] = set()
+def renames_to(entries: Sequence[AuditEntry], cell: str) -> tuple[RenamedCell, ...]:
+    """Return the renames after which a cell has its present name, oldest first: one for each name that it had."""
+    present: dict[str, str] = {}
+    found = []
     for one in reversed(entries):
         rename = rename_of(one)
-        if rename is not None and (rename.new == cell or rename.new in names):
-            names.add(rename.old)
-    return frozenset(names - {cell})
+        if rename is None:
+            continue
+        present[rename.old] = present.get(rename.new, rename.new)
+        if present[rename.old] == cell:
+            found.append(rename)
+    return tuple(reversed(found))
+
+
+def former_names(entries: Sequence[AuditEntry], cell: str) -> frozenset[str]:
+    """Return the names that a cell had before."""
+    return frozenset(rename.old for rename in renames_to(entries, cell)) - {cell}
 
 
 def renamed_to(entries: Iterable[AuditEntry], cell: str) -> RenamedCell | None:
@@ -90,11 +100,15 @@ def renamed_to(entries: Iterable[AuditEntry], cell: str) -> RenamedCell | None:
     return found
 
 
+NOT_OF_HISTORY = frozenset({AuditAction.RENAMED, AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED})
+"""Entries that leave nothing in a history: a job that is held for its cell's old name has two, and renames nothing."""
+
+
 def cell_names(entries: Iterable[AuditEntry]) -> frozenset[str]:
-    """Return the names of all cells that something was entered for, by calibrations, writes or sessions."""
+    """Return the names of all cells that have something in a history: calibrations, writes, explained changes."""
     names: set[str] = set()
     for one in entries:
-        if one.action is AuditAction.RENAMED:
+        if one.action in NOT_OF_HISTORY:
             continue
         calibration = one.details.get("calibration")
         of_calibration = calibration.get("cell") if isinstance(calibration, dict) else None

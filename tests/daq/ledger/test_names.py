@@ -33,7 +33,7 @@ from daq.ledger.ledger import (
     rename_cell,
     verify_ledger,
 )
-from daq.ledger.names import drives_of
+from daq.ledger.names import drives_of, former_names
 from daq.ledger.watch import watch
 from ident.calibration import Calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, ledger_in, write
@@ -171,6 +171,39 @@ def test_a_cell_may_be_renamed_twice_and_back(ledger: Ledger, renamed: Ledger) -
         history = read_history(left)
         assert history.entries == ()
         assert history.renamed is not None
+
+
+def _rename(ledger: Ledger, old: str, week: int) -> None:
+    rename_cell(ledger, plan_rename(ledger, old), who="anna", at=BEGIN + timedelta(weeks=week))
+
+
+def test_a_name_that_a_rename_has_freed_may_be_that_of_another_cell(ledger: Ledger) -> None:
+    """The name that one robot had is another one's by now: each keeps its own calibrations."""
+    first, second = ledger, _named(ledger, "press")
+    of_first = _enter(first, _made(first.cell, 0), 0)
+    of_second = _enter(second, _made(second.cell, 1, FALLEN), 1)
+    line = _named(ledger, "line")
+    _rename(line, "press", 2)
+    press = _named(ledger, "press")
+    _rename(press, "demo", 3)
+    assert [entry.digest for entry in read_history(press).entries] == [of_first]
+    assert [entry.digest for entry in read_history(line).entries] == [of_second]
+    entries = read(press.audit)
+    assert former_names(entries, "press") == {"demo"}
+    assert former_names(entries, "line") == {"press"}
+    again = plan_rename(press, "demo")
+    assert again.entered_at == BEGIN + timedelta(weeks=3)
+
+
+def test_a_job_that_was_held_for_its_old_name_is_no_history_of_that_name(renamed: Ledger) -> None:
+    _rename(renamed, "demo", 11)
+    before = len(read(renamed.audit))
+    began = AuditAction.RECALIBRATION_BEGUN
+    record_session(renamed.audit, began, at=LATER, who="timer", subject="s", details={"cell": "demo"})
+    planned = plan_rename(renamed, "demo")
+    assert planned.entered_at is not None
+    rename_cell(renamed, planned, who="anna", at=LATER)
+    assert len(read(renamed.audit)) == before + 1
 
 
 def test_a_rename_to_the_name_of_another_robot_is_refused(ledger: Ledger) -> None:
