@@ -57,6 +57,7 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
     is_gathered = weights != 0.0
     allowed = is_gathered * WEIGHT_TOLERANCE * np.maximum(1.0, np.abs(weights)) + is_seen * ROUNDED
     excess = change / np.linalg.norm(allowed * by_torque, axis=1)
+    excess[~is_seen[leading]] = 0.0  # it moves nothing here, as a link's moment does where gravity is along the axis
     worst = int(np.argmax(excess))
     return compared[worst] if excess[worst] > 1.0 else None
 

@@ -74,5 +74,15 @@ def test_a_corrected_length_is_no_other_robot() -> None:
     assert foreign_base_parameter(corrected, _names(model, list(range(6)))) is None
 
 
+def test_a_parameter_that_moves_nothing_here_is_of_no_other_robot() -> None:
+    """A base that leans shows first moments of the first link, which an upright one does not."""
+    leaning = _model(TX40, gravity=(0.5, 0.3, -9.79))
+    upright = _model(TX40)
+    names = _names(leaning, list(range(6)))
+    assert len(names) > len(_names(upright, list(range(6))))
+    assert foreign_base_parameter(leaning, names) is None
+    assert foreign_base_parameter(upright, names) is None
+
+
 def test_no_parameters_contradict_nothing() -> None:
     assert foreign_base_parameter(_model(TX40), ()) is None
