@@ -387,7 +387,12 @@ def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibrat
         CalibrationMissing: the file does not exist, is a folder or a pipe, or cannot be read.
         CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or number, with its line.
         CalibrationRefused: the content was edited, with the names of the edited sections.
+        EffectRefused: one of `own_effects` is no effect that can be used.
     """
+    if own_effects != ():
+        from ident.effects.own import families_of  # noqa: PLC0415 - reading a calibration needs no effects
+
+        families_of(own_effects, "`own_effects`")
     calibration = decode_calibration(read_calibration_bytes(path), str(path))
     return replace(calibration, own_effects=tuple(own_effects))
 

@@ -310,7 +310,7 @@ def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) 
         )
     if row == 0 and text.lower() not in MISSING and not any(np.isfinite(values[0])):
         return (
-            "if this line is no row (units, a second header), leave it out: `keep: {from_row: 2}` in the import "
-            "description"
+            "if this line is no row (units, a second header), leave it out: "
+            f"`keep: {{from_row: {file.first_row + 2}}}` in the import description"
         )
     return cut_advice(values, file.first_row)

@@ -156,8 +156,8 @@ class Effect(ABC):
         """Settings that are fitted together with the whole model; the values that a family has are where to begin.
 
         Of an effect of one's own, all real settings where it has two or more: kept at a value that somebody gave, they
-        would leave a rest that other effects explain, and σ would not know it. A single one is refined between its
-        neighbours in the family. An empty tuple leaves them as they are given.
+        would leave a rest that other effects explain, and σ would not know it. Without names here, the first positive
+        one that has smaller and larger values in the family is refined between them, once it was chosen.
         """
         real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
         return real if len(real) > 1 and not is_shipped(self) else ()
@@ -209,6 +209,13 @@ class Effect(ABC):
 def setting_range(effect: Effect, setting: str) -> Range:
     """Return the values that a setting of an effect can have."""
     return _ranges(type(effect))[setting]
+
+
+def setting_kind(effect: Effect, setting: str) -> type:
+    """Return the type of a setting, as it is annotated: int, or float for one that can be refined."""
+    hint = get_type_hints(type(effect), include_extras=True)[setting]
+    kind: type = get_args(hint)[0]
+    return kind
 
 
 @cache

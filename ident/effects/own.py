@@ -19,7 +19,7 @@ from importlib.metadata import EntryPoint, entry_points, packages_distributions,
 from itertools import chain
 
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
-from ident.effects.effect import Effect, is_shipped, setting_range
+from ident.effects.effect import Effect, GearSide, is_shipped, setting_kind, setting_range
 from ident.errors import EffectRefused
 
 ENTRY_POINT_GROUP = "drivegain.effects"
@@ -171,6 +171,10 @@ def _check(effect: Effect, where: str) -> None:
         )
     if name in SHIPPED and not is_shipped(effect):
         raise EffectRefused(f"{where}: found an effect with the name {name!r}, which drivegain has; give it another")
+    if name in SHIPPED:
+        raise EffectRefused(
+            f"{where}: found drivegain's own effect {name!r}; expected others: it is tried without this"
+        )
     kept = set(effect.settings)
     lost = [field.name for field in fields(effect) if field.name not in kept]
     if lost:
@@ -178,7 +182,18 @@ def _check(effect: Effect, where: str) -> None:
             f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; expected each as "
             "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
         )
+    if effect.side is GearSide.TWO_JOINTS and "other_axis" not in kept:
+        raise EffectRefused(
+            f"{where}: found effect {name!r} on two joints without a setting `other_axis`; expected the number of the "
+            "second one: `other_axis: Annotated[int, ident.Range(0, 12)] = 0`"
+        )
     for setting, value in effect.settings.items():
+        kind = setting_kind(effect, setting)
+        if type(value) is not kind:
+            raise EffectRefused(
+                f"{where}: found {setting} = {value!r} in effect {name!r}; expected a value of type {kind.__name__}, "
+                f"as it is annotated; write {kind.__name__}({value!r})"
+            )
         allowed = setting_range(effect, setting)
         if not allowed.least <= value <= allowed.largest:
             raise EffectRefused(

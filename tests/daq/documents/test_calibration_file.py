@@ -22,6 +22,7 @@ from daq.documents.calibration_file import (
 )
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
 from ident.calibration import Calibration, PayloadMass
+from ident.errors import EffectRefused
 from tests.daq.calibrations import calibrations, demo_calibration
 
 
@@ -189,3 +190,9 @@ def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
     content = encode_calibration(dataclasses.replace(calibration, payload_mass=(impossible,)))
     with pytest.raises(CalibrationUnreadable, match="payload_mass"):
         decode_calibration(content, "calibration.yaml")
+
+
+@pytest.mark.parametrize("given_as", [None, "spring", 3.0])
+def test_own_effects_that_are_no_list_of_effects_are_refused_before_a_file_is_used(path: Path, given_as: Any) -> None:
+    with pytest.raises(EffectRefused, match=r"^`own_effects`: found .*; expected "):
+        load_calibration(path, own_effects=given_as)

@@ -176,6 +176,11 @@ def test_a_line_of_other_words_is_refused_with_the_setting(tmp_path: Path, line:
 def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: Path) -> None:
     with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 2\}`"):
         _read(tmp_path, ["t,q,i", "Time,Position,Current", *ROWS])
+    again = ["t,q,i", *ROWS[:5], "Time,Position,Current", *ROWS[5:]]
+    with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 7\}`"):
+        _read(tmp_path, again, keep=KeptPart(from_row=6))
+    rest = _read(tmp_path, again, keep=KeptPart(from_row=7))
+    np.testing.assert_array_equal(rest.values, READ[5:])
 
 
 @pytest.mark.parametrize("sign", ["#", "%", "//"])

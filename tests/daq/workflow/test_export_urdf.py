@@ -143,7 +143,11 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for joint, link in enumerate(urdf_links(GANTRY.urdf)):
         standard[14 * joint : 14 * joint + 14] = (*(1.3 * link), 0.5, 3.0, 4.0, 0.2)
     limits = np.repeat([[0.0], [1.0], [2.0], [5.0]], 5, axis=1)
-    save_calibration(_calibration("any", model, limits, standard), file)
+    calibration = _calibration("any", model, limits, standard)
+    # An effect of a package that is not installed is left out, as every effect is.
+    cosine = Parameter("ring-friction cosine 2", 0.1, 0.01, "Nm")
+    missing = AcceptedEffect("ring-friction", calibration.gains[1].axis, {}, (cosine,), 6.1, 3.4, package="rings 1.2.0")
+    save_calibration(replace(calibration, effects=(*calibration.effects, missing)), file)
     assert _export(file, "--urdf", source, "--out", out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["same_configuration"] is None

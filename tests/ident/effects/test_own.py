@@ -15,7 +15,7 @@ import ident
 from ident.arrays import FloatArray
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import columns_at, fits_data
-from ident.effects.own import families_of, installed_families, known_effect, package_of, search_families
+from ident.effects.own import SHIPPED, families_of, installed_families, known_effect, package_of, search_families
 from ident.effects.signals import Signals
 
 SAMPLES = 5
@@ -75,6 +75,14 @@ class Colon(SquareDrag):
 
 
 @dataclass(frozen=True, slots=True)
+class Lonely(SquareDrag):
+    """On two joints, without saying on which."""
+
+    name = "lonely-drag"
+    side = ident.GearSide.TWO_JOINTS
+
+
+@dataclass(frozen=True, slots=True)
 class Twice(SquareDrag):
     """Two coefficients of one name."""
 
@@ -97,6 +105,9 @@ class Misspelled(SquareDrag):
         (None, r"None; expected a list of effects"),
         ([SquareDrag(7.0)], r"exponent = 7 in effect 'square-drag'; expected a value from 0.5 to 3"),
         ([SquareDrag(float("nan"))], r"exponent = nan in effect 'square-drag'; expected a value"),
+        ([SquareDrag(1)], r"exponent = 1 in effect 'square-drag'; expected a value of type float.*write float\(1\)"),
+        ([Lonely()], r"effect 'lonely-drag' on two joints without a setting `other_axis`; expected the number"),
+        ([SHIPPED["spring"]], r"drivegain's own effect 'spring'; expected others: it is tried without this"),
         ([Twice()], r"coefficients \['drag', 'drag'\] of effect 'twice-drag'; expected a name for each"),
         ([Misspelled()], r"exponents in `refined` of effect 'misspelled-drag'; expected names among its .*: exponent"),
         ([SquareDrag], r"the class SquareDrag; expected objects of subclasses of `ident.Effect`"),
