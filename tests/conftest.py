@@ -55,9 +55,16 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+WHOLE_SESSION = "whole_session"
+"""Fixture that takes 17 s: one test that is not slow would make it for itself."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first."""
+    """Run the longest files first; call slow what takes a whole guided session."""
     items.sort(key=lambda item: item.path.name not in LONG)
+    for item in items:
+        if WHOLE_SESSION in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
 
 
 TOGETHER = "tests/daq/jobs/"
