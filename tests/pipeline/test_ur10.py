@@ -17,6 +17,8 @@ from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry, with_gravity
 from tests.studies.real_runs import ur10
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("tilt_deg", [5.0, 9.0])
 def test_a_leaning_base_is_named_and_no_zero(shared_data: Path, tilt_deg: float) -> None:

@@ -1002,6 +1002,7 @@ def test_a_disk_that_fails_leaves_the_old_pictures(
     assert {path.name for path in tmp_path.iterdir()} == {"torques.svg", "gains.png", "residual-J3-spring.svg"}
 
 
+@pytest.mark.slow
 def test_the_verb_writes_the_report_and_says_the_same(
     shelved: Shelf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -190,6 +190,7 @@ def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
     return [(one.gate, one.subject) for one in check_gates(context) if one.gate is not Gate.SOURCES]
 
 
+@pytest.mark.slow
 def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -> None:
     """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
     nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
@@ -205,6 +206,7 @@ def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -
     assert held.axes[1] < 0.97 * bare.axes[1]
 
 
+@pytest.mark.slow
 def test_one_wrong_gain_among_good_ones_is_refused_in_spite_of_an_effect(with_effect: Fit) -> None:
     assert _refused(calibration_of(with_effect, NOW)) == []
     assert _refused(_with_gains(with_effect, (1.0,) * 6)) == []
@@ -231,6 +233,7 @@ def test_an_effect_on_all_motors_is_not_called_the_first_axis_s(checkout: Path) 
     assert PlacedEffect(Lag(), 0).axis_name(cell.axis_names) == "J1"
 
 
+@pytest.mark.slow
 def test_a_delay_of_all_axes_is_predicted_from_the_file(with_effect: Fit) -> None:
     first = with_effect.steps[0]
     assert first.accepted is not None

@@ -39,6 +39,7 @@ def _fit(log: Path, *options: object) -> int:
     return main(["fit", str(log), "--gains", "fixed", *map(str, options)])
 
 
+@pytest.mark.slow
 def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -105,6 +105,7 @@ def aimed(experiment: Experiment, outlook: Outlook, room: AcceptedRoom) -> tuple
     return tuple(_next(experiment, outlook, room, seed, is_aimed=True) for seed in SEEDS)
 
 
+@pytest.mark.slow
 def test_the_worst_gain_of_the_estimate_falls_faster_than_with_moves_for_all_gains(
     experiment: Experiment, outlook: Outlook, room: AcceptedRoom, aimed: tuple[Plan, ...]
 ) -> None:
@@ -121,6 +122,7 @@ def test_the_worst_gain_of_the_estimate_falls_faster_than_with_moves_for_all_gai
     assert max(ratios) < 1.03
 
 
+@pytest.mark.slow
 def test_the_next_moves_stay_inside_what_was_accepted(
     experiment: Experiment, accepted: tuple[Plan, ...], room: AcceptedRoom, aimed: tuple[Plan, ...]
 ) -> None:

@@ -20,6 +20,8 @@ from ident.discovery.loop import find_effects
 from ident.discovery.search import rank_families
 from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record
 
+pytestmark = pytest.mark.slow
+
 GATES = Gates(draws=199)
 COSINE_NM = 9.0
 SINE_NM = -6.0

@@ -37,6 +37,8 @@ from tests.ident.recordings import (
     three_axes_truth,
 )
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 AXIS = 1  #: Its rotor moves as its link does

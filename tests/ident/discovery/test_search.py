@@ -13,6 +13,8 @@ from ident.discovery.evidence import Evidence
 from ident.discovery.loop import find_effects
 from tests.ident.recordings import GAINS, Truth, gathered
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 

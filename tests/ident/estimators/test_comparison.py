@@ -10,6 +10,8 @@ from ident.data.run import Run
 from ident.estimators.comparison import CUTOFF_FACTORS, ESTIMATORS, EstimatorComparison, try_estimators
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 
