@@ -33,6 +33,9 @@ from ident.calibration import Gain
 HERE = "127.0.0.1"
 TRIMMING = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
 """By which dask lets its workers give memory back after every use: a fit would spend a fifth of its time on that."""
+WORKER_LOG = "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED"
+"""By which workers choose what they log. A fit that fails is an error of its task; what they log besides is about their
+end, where on a busy machine a heartbeat finds the scheduler gone: a traceback that says nothing to anybody."""
 CONNECT_S = 10  #: How long a scheduler may take to answer [s]
 
 
@@ -91,7 +94,7 @@ def _processes(workers: int) -> Iterator[WorkerPool]:
     # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard is left out;
     # its HTTP server cannot be, and takes a free port: on the usual one it would warn of any other cluster.
     with (
-        dask.config.set({TRIMMING: None}),
+        dask.config.set({TRIMMING: None, WORKER_LOG: "critical"}),
         distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

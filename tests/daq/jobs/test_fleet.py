@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import os
 import re
 import shutil
@@ -439,6 +440,14 @@ def test_what_is_not_installed_is_named_with_the_line_that_installs_it(monkeypat
         pass
     with pytest.raises(ConfigurationMissing, match="nonsense"):
         list_logs("nonsense://bucket/logs")
+
+
+def test_processes_of_this_machine_say_nothing_about_their_end() -> None:
+    """On a busy machine a heartbeat finds the scheduler gone, and a worker would print its traceback."""
+    of_a_worker = logging.getLogger("distributed.worker")
+    with worker_pool("processes", 1) as pool:
+        level = pool.executor.submit(of_a_worker.getEffectiveLevel).result()
+    assert level == logging.CRITICAL
 
 
 def test_processes_of_this_machine_listen_to_no_one_else() -> None:
