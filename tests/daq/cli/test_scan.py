@@ -476,6 +476,7 @@ def hear_recorder(cell: Cell, until: Callable[[Link], bool]) -> Link:
         link.close()
 
 
+@pytest.mark.slow
 def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

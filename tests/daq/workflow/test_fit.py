@@ -61,6 +61,14 @@ def _paths(*names: str) -> list[Path]:
     return [Path(name) for name in names]
 
 
+@pytest.fixture(scope="module")
+def pair(shelf: Shelf) -> Fit:
+    """A fit of one run without load and one with it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", shelf.load)
+        return fit(_paths("run0", "run1"))
+
+
 def test_logs_become_sources_with_their_roles(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     found = fit(_paths("run0", "run1", "run2"), holdout=_paths("run3"))
@@ -121,9 +129,9 @@ def moves_in(found: Fit) -> int:
     return len(found.identification.system.clusters)
 
 
-def test_a_sigma_of_few_moves_is_said_to_be_rough(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sigma_of_few_moves_is_said_to_be_rough(shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    found = fit(_paths("run0", "run1"))
+    found = pair
     moves = moves_in(found)
     (note,) = sigma_notes(found)
     (percent,) = re.findall(r"known to (\d+) % only", note)
@@ -139,14 +147,15 @@ def test_a_sigma_of_few_moves_is_said_to_be_rough(shelf: Shelf, monkeypatch: pyt
     assert [*sigma_notes(found)] == []
 
 
-def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_axis_that_did_not_move_has_a_dash_and_no_number(
+    shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    found = fit(_paths("run0", "run1"))
-    calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
+    calibration = calibration_of(pair, datetime(2025, 1, 2, tzinfo=UTC))
     rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
     out = io.StringIO()
     rested_on = replace(calibration, holdout_error_percent=rested)
-    Console(file=out, width=100).print(*fit_view(CaseFit(found, (), None), rested_on, None), sep="\n")
+    Console(file=out, width=100).print(*fit_view(CaseFit(pair, (), None), rested_on, None), sep="\n")
     (held_out,) = (line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out"))
     assert held_out == ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
 

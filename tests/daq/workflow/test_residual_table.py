@@ -32,6 +32,7 @@ def _table(path: Path) -> dict[str, FloatArray]:
     return dict(zip(names, numbers.T, strict=True))
 
 
+@pytest.mark.slow
 def test_a_real_log_as_a_table(real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, log = real
     out = tmp_path / "residual.csv"

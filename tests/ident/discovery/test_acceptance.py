@@ -24,6 +24,8 @@ from ident.effects.friction import AsymmetricViscous, Stribeck
 from ident.effects.position import Spring
 from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, with_current
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 STICKING = PlacedEffect(Stribeck(0.3), 1)

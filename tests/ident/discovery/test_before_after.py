@@ -33,6 +33,8 @@ from ident.equations.linearisation import cut_into_folds, linearise
 from ident.estimators.identify import identify
 from tests.ident.recordings import CONDITIONING, GAINS, Truth, gathered
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 
 SPRING = PlacedEffect(Spring(), 2)

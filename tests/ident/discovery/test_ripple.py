@@ -22,6 +22,8 @@ from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
 from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, search_problem_of
 
+pytestmark = pytest.mark.slow
+
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 RIPPLES = tuple(family for family in EFFECTS if isinstance(family[0], Ripple | Cogging))

@@ -55,6 +55,19 @@ def whole(small_truth: Truth, long_runs: tuple[Run, ...]) -> GrowingFit:
     return _grown(small_truth, long_runs)
 
 
+@pytest.fixture(scope="module")
+def labelled(long_runs: tuple[Run, ...]) -> tuple[Run, ...]:
+    """Both, with the number of the move of each sample: targets change every MOVE_SAMPLES, joints rest halfway."""
+    move = (np.arange(LONG_SAMPLES) + MOVE_SAMPLES // 2) // MOVE_SAMPLES
+    return tuple(replace(run, move=move) for run in long_runs)
+
+
+@pytest.fixture(scope="module")
+def labelled_whole(small_truth: Truth, labelled: tuple[Run, ...]) -> GrowingFit:
+    """The same, each read once at its end."""
+    return _grown(small_truth, labelled)
+
+
 def _empty(truth: Truth) -> GrowingFit:
     return GrowingFit(truth.model, SMALL, (MOUNTED,))
 
@@ -117,20 +130,17 @@ def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(
 @settings(deadline=None, max_examples=8)
 @given(lengths=st.lists(st.integers(3, LONG_SAMPLES - 1), max_size=6))
 def test_a_move_that_a_look_divides_counts_once(
-    small_truth: Truth, long_runs: tuple[Run, ...], lengths: list[int]
+    small_truth: Truth, labelled: tuple[Run, ...], labelled_whole: GrowingFit, lengths: list[int]
 ) -> None:
-    # Targets change every MOVE_SAMPLES; the joints rest halfway between.
-    move = (np.arange(LONG_SAMPLES) + MOVE_SAMPLES // 2) // MOVE_SAMPLES
-    labelled = tuple(replace(run, move=move) for run in long_runs)
     fit = _empty(small_truth)
     for run in labelled:
+        assert run.move is not None
         for length in sorted(lengths):
-            part = replace(first_samples(run, length), move=move[:length])
+            part = replace(first_samples(run, length), move=run.move[:length])
             fit = fit.with_run_so_far(part)
         fit = fit.with_run(run)
-    whole = _grown(small_truth, labelled)
-    assert fit.move_count == whole.move_count
-    assert _std(fit.gains()) == pytest.approx(_std(whole.gains()), rel=1e-6)
+    assert fit.move_count == labelled_whole.move_count
+    assert _std(fit.gains()) == pytest.approx(_std(labelled_whole.gains()), rel=1e-6)
 
 
 def test_rows_near_the_border_wait_and_are_then_those_of_the_whole_run(

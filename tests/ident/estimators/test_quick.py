@@ -14,7 +14,7 @@ from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
-from ident.estimators.quick import mixed_tls, quick_gains
+from ident.estimators.quick import QuickGains, mixed_tls, quick_gains
 from ident.model.bodies import Payload
 from tests.ident.closed_recordings import recorded
 from tests.ident.mechanisms import FIVE_BAR
@@ -68,21 +68,32 @@ def test_weighted_least_squares_makes_gains_too_small_where_it_does_not(standard
     assert np.max(wls(regrouped(standard)).gains / GAINS) < 0.95
 
 
+@pytest.fixture(scope="module")
+def small_pieces(small_truth: Truth) -> tuple[Run, ...]:
+    """Short recordings of the arm of three axes."""
+    return noisy_pieces(small_truth, 5)
+
+
+@pytest.fixture(scope="module")
+def small_gains(small_truth: Truth, small_pieces: tuple[Run, ...]) -> QuickGains:
+    """Their gains."""
+    return quick_gains(reduce_runs(small_truth.model, small_pieces, SMALL))
+
+
 @settings(deadline=None, max_examples=10)
 @given(exponents=st.lists(st.integers(-4, 4), min_size=3, max_size=3), heavier=st.floats(0.1, 10.0))
 def test_gains_are_in_the_units_of_currents_and_payload(
-    small_truth: Truth, exponents: list[int], heavier: float
+    small_truth: Truth, small_pieces: tuple[Run, ...], small_gains: QuickGains, exponents: list[int], heavier: float
 ) -> None:
     """A current in other units divides its gain; a payload of other weight multiplies all of them."""
     unit = 10.0 ** np.array(exponents)
-    runs = noisy_pieces(small_truth, 5)
+    before = small_gains
     changed = []
-    for run in runs:
+    for run in small_pieces:
         payload = run.payload
         if payload is not None:
             payload = Payload(payload.name, payload.mounting, {"m": heavier * payload.known["m"]})
         changed.append(replace(run, current_a=run.current_a * unit, payload=payload))
-    before = quick_gains(reduce_runs(small_truth.model, runs, SMALL))
     after = quick_gains(reduce_runs(small_truth.model, changed, SMALL))
     assert before.gains is not None
     assert before.gains_std is not None
