@@ -64,9 +64,9 @@ def export_urdf_verb(
     if out.exists() and out.read_bytes() == content:
         raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
     parse_markup(content, str(given))  # before any other reader sees it
+    declared = None if urdf is not None else _declared(known, given)
     known, _ = split_installed(known)  # a URDF holds no effects
-    if urdf is None:
-        declared = _declared(known, given)
+    if declared is not None:
         known, model = on_cell(known, declared)
         limits = cell_limits(declared)
         same = _is_same(known, declared)
