@@ -152,10 +152,11 @@ class _Client(asyncio.Protocol):
         if not self._is_cell and self._transport.get_write_buffer_size() > BACKLOG_BYTES:
             self.drop()
 
-    def _say(self, answer: bytes) -> None:
-        """Write an answer of the hub itself."""
-        self._answered = True
-        self._write(answer)
+    def _say(self, answers: list[bytes]) -> None:
+        """Write answers of the hub itself at once: asyncio counts all that waits anew with each write."""
+        if answers:
+            self._answered = True
+            self._write(b"".join(answers))
 
     def data_received(self, data: bytes) -> None:
         if not self._full:
@@ -163,16 +164,18 @@ class _Client(asyncio.Protocol):
         buffer = self._incoming + data
         end = 0
         frames = []
+        answers = []
         stamp = b"%.6f" % time.time()
         for match in _COMMAND.finditer(buffer):
             end = match.end()
             identifier, length, payload, command = match.groups()
             if command is not None or not self._raw:
-                self._answer(command)
+                answers.append(self._answer_to(command))
             elif len(match[0]) <= _MAX_COMMAND_BYTES and (frame := _frame(identifier, int(length, 16), payload, stamp)):
                 frames.append(frame)
             else:
-                self._say(b"< error malformed frame >")
+                answers.append(b"< error malformed frame >")
+        self._say(answers)
         self._incoming = buffer[end:]
         if len(self._incoming) > _MAX_COMMAND_BYTES:
             self.drop()  # this is not the socketcand protocol
@@ -183,25 +186,25 @@ class _Client(asyncio.Protocol):
                     other._write(burst)
         self._throttle()
 
-    def _answer(self, command: bytes | None) -> None:
+    def _answer_to(self, command: bytes | None) -> bytes:
+        """Do what a command says, and return the answer; None is a frame that is sent before the raw mode."""
         words = b"send" if command is None else command[:_MAX_COMMAND_BYTES]
         word, _, argument = words.decode("ascii", "replace").strip().partition(" ")
         if word == "open" and self._raw:
-            self._say(b"< error a bus is open >")
-        elif word == "open" and argument in self._hub.channels:
+            return b"< error a bus is open >"
+        if word == "open" and argument in self._hub.channels:
             self._channel = argument
-            self._say(b"< ok >")
-        elif word == "open":
+            return b"< ok >"
+        if word == "open":
             known = ", ".join(self._hub.channels)
-            self._say(f"< error no bus {argument}, there is {known} >".encode("ascii", "replace"))
-        elif word == "rawmode" and self._channel is not None:
+            return f"< error no bus {argument}, there is {known} >".encode("ascii", "replace")
+        if word == "rawmode" and self._channel is not None:
             self._raw = True
             self._hub.cells.setdefault(self._channel, self)
-            self._say(b"< ok >")
-        elif word == "echo":
-            self._say(b"< echo >")
-        else:
-            self._say(b"< error unknown command >")
+            return b"< ok >"
+        if word == "echo":
+            return b"< echo >"
+        return b"< error unknown command >"
 
 
 def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> bytes | None:

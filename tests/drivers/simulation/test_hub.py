@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -98,10 +97,6 @@ def test_a_cell_that_reads_late_keeps_little_waiting_for_it() -> None:
         cell.shutdown()
 
 
-@pytest.mark.skipif(
-    sys.version_info[:2] == (3, 12),
-    reason="an open defect: with Python 3.12 others may wait 30 s for it",
-)
 @pytest.mark.parametrize("line", [b"< send 12345 8 01 >", b"< echo >", b"< nonsense >", b"<>"])
 def test_a_deaf_client_that_is_answered_holds_up_nobody_and_fills_no_output(
     line: bytes, caplog: pytest.LogCaptureFixture
