@@ -182,7 +182,19 @@ class ObjectAccessError(NodeError):
 
 
 class SetupRefused(NodeError):
-    """An amplifier is not the configured one, or cannot be set up for a recording."""
+    """An amplifier is not the configured one, or cannot be set up for a recording.
+
+    Without `expected` and `remedy` the text of what was found has the rest.
+    """
+
+    expected: str = ""
+    remedy: str = ""
+
+    def __init__(self, node: Node, found: str, *, expected: str = "", remedy: str = "") -> None:
+        super().__init__(node, f"{found}; expected {expected}; {remedy}" if remedy else found)
+        self.found = f"{node_label(node)}: {found}"
+        self.expected = expected
+        self.remedy = remedy
 
 
 class StateRefused(NodeError):

@@ -290,11 +290,9 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
             return f"bus {error.address}", *known
     if isinstance(error, driver.MotionRefused) and error.remedy and verb != "demo":
         return "motion is refused", error.found, error.expected, error.remedy
-    if isinstance(error, driver.SetupRefused) and verb != "demo":
-        found, _, stated = str(error).partition("; expected ")
-        expected, _, remedy = stated.partition("; ")
-        if remedy:  # what the drive itself showed says more than the kind of the error
-            return found, found, expected, remedy
+    if isinstance(error, driver.SetupRefused) and error.remedy and verb != "demo":
+        # What the drive itself showed says more than the kind of the error.
+        return error.found, error.found, error.expected, error.remedy
     known_advice = ADVICE_WITHIN["demo"] if verb == "demo" else ADVICE | ADVICE_WITHIN.get(verb, {})
     advice = next((known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", ""))
     said = str(error)

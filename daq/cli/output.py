@@ -1,8 +1,8 @@
-"""Standard output and error that never hold up whoever prints.
+"""Standard output and error that never block whoever prints.
 
 A terminal whose output is stopped (Ctrl-S), a pipe that nobody reads, and an SSH connection that is gone block a write
 for as long as they like. Here a thread of its own writes, in order, what the verbs print, and they go on: the axes are
-stopped, the log is finished and the bus is free, whatever becomes of the screen. Where nobody reads, progress is left
+stopped, the log is finished and the bus is free, also when the screen is gone. Where nobody reads, progress is left
 out first (`is_behind`), then remarks, and their number is printed as soon as somebody reads again. Results are never
 left out: the end of the command waits for their reader.
 """

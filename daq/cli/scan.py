@@ -173,9 +173,10 @@ def _misfit_of(network: CanopenNetwork, axis: Axis) -> str:
     from drivers.canopen.setup import misfit
 
     try:
-        return misfit(network.link.objects(axis.node_id), axis.profile, shipped_profiles)
+        lacking = misfit(network.link.objects(axis.node_id), axis.profile, shipped_profiles)
     except DriverError:
         return ""
+    return "" if lacking is None else str(lacking)
 
 
 def _fault_of(network: CanopenNetwork, axis: Axis) -> str:

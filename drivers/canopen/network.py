@@ -268,8 +268,9 @@ class CanopenNetwork:
             if shared := self.link.shared_id(axis.node_id, period_ms):
                 raise SetupRefused(
                     axis,
-                    f"found {shared}; expected one device with this node id; two have it, and both would move: nothing "
-                    "has moved, give one of them another node id",
+                    f"found {shared}",
+                    expected="one device with this node id",
+                    remedy="two have it, and both would move: nothing has moved, give one of them another node id",
                 )
 
     def prepare(self) -> None:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:  # the load of a bus is computed without opening one
 
 HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 PDO_BYTES = 8
+MAPPABLE = "a PDO that can be mapped for the recording"
 NOT_MAPPABLE = (
-    "; expected a PDO that can be mapped for the recording; is it fixed by the maker, or does another tool set the "
-    "drive up now? end that tool, or switch the drive off and on"
+    "is it fixed by the maker, or does another tool set the drive up now? end that tool, or switch the drive off and on"
 )
 PDOS = 4  #: PDOs of the predefined connection set, in each direction
 MOST_ENTRIES = 64  #: Objects that one PDO can carry, a bit each (CiA 301)
@@ -270,8 +270,9 @@ def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
             fixed = entry == cob_id and error.abort_code == READ_ONLY and as_before
             if not fixed:
                 reason = f"{record.name}: writing {value:#x} to {entry}: {error.reason}"
-                advice = "" if error.abort_code is None else NOT_MAPPABLE
-                raise SetupRefused(access, f"{reason}{advice}") from error
+                if error.abort_code is None:
+                    raise SetupRefused(access, reason) from error
+                raise SetupRefused(access, reason, expected=MAPPABLE, remedy=NOT_MAPPABLE) from error
     found = read_pdo_record(access, record.direction, record.number)
     if (
         found is None

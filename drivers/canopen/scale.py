@@ -47,7 +47,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     """
 
     def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
-        return SetupRefused(access, f"profile {profile.name}: found {found}; expected {expected}; {remedy}")
+        return SetupRefused(access, f"profile {profile.name}: found {found}", expected=expected, remedy=remedy)
 
     scale = profile.current_scale
     entry = profile.current

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 
 from drivers.canopen.link import Link
@@ -149,30 +149,45 @@ def refusal(error: ObjectAccessError, axis: Axis) -> SetupRefused:
     what = f" ({purpose})" if purpose else ""
     return SetupRefused(
         axis,
-        f"found object {error.entry}{what} refused: {error.reason}; expected an answer, as from the other objects that "
-        "a recording needs; nothing has moved: is the drive being set up or updated by another tool, or in a state "
-        "that locks its objects? switch it off and on, then try again",
+        f"found object {error.entry}{what} refused: {error.reason}",
+        expected="an answer, as from the other objects that a recording needs",
+        remedy="nothing has moved: is the drive being set up or updated by another tool, or in a state that locks its "
+        "objects? switch it off and on, then try again",
     )
 
 
-def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> str:
-    """Describe the objects of a profile that a drive does not have, and name a profile that fits; empty if it has all.
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """What a drive lacks of its profile."""
+
+    found: str  #: objects that it does not have, or of another size
+    expected: str  #: instead
+    remedy: str  #: what to do
+
+    def __str__(self) -> str:
+        return f"found {self.found}; expected {self.expected}; {self.remedy}"
+
+
+def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> Misfit | None:
+    """Describe the objects of a profile that a drive does not have, and name a profile that fits; None if it has all.
 
     Raises:
         ObjectAccessError: the drive does not answer.
     """
     lacking = _lacking(access, profile)
     if not lacking:
-        return ""
+        return None
+    found = ", ".join(lacking)
+    expected = f"every object of profile {profile.name}"
     if any(str(HEARTBEAT_TIME) in one for one in lacking):
-        return f"found {', '.join(lacking)}; expected every object of profile {profile.name}; {HEARTBEATS_NEEDED}"
+        return Misfit(found, expected, HEARTBEATS_NEEDED)
     fitting = [other for other in others() if other.name != profile.name and not _lacking(access, other)]
     if fitting:
         advice = " or ".join(f"`{other.name}` ({_difference(other, profile)})" for other in fitting)
         remedy = f"use a profile that fits this drive: {advice}"
     else:
         remedy = "no shipped profile fits this drive: write one with the objects of its manual"
-    return f"found {', '.join(lacking)}; expected every object of profile {profile.name}; {remedy}"
+    return Misfit(found, expected, remedy)
 
 
 def why_no_heartbeat(access: ObjectAccess) -> str:
@@ -312,8 +327,9 @@ class AxisSetup:
         """
         access = self._access
         axis = self._axis
-        if found := misfit(access, axis.profile, profiles):
-            raise SetupRefused(axis, found)
+        lacking = misfit(access, axis.profile, profiles)
+        if lacking is not None:
+            raise SetupRefused(axis, f"found {lacking.found}", expected=lacking.expected, remedy=lacking.remedy)
         if access.read_optional(PROFILE_DECELERATION) is None:
             self._absent = (PROFILE_DECELERATION,)  # such a drive brakes with its profile acceleration
         for direction in Direction:
@@ -381,7 +397,7 @@ class AxisSetup:
             if error.abort_code is None:
                 raise
             found = f"{action} {entry} is refused ({error.reason})"
-            raise SetupRefused(self._axis, f"found {found}; expected {expected}; {remedy}") from error
+            raise SetupRefused(self._axis, f"found {found}", expected=expected, remedy=remedy) from error
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.

@@ -51,8 +51,10 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
 
     start = np.array([effect.settings[name] for name in names])
     unit = _units(effect, start)
-    simplex = start + np.vstack((np.zeros(len(names)), FIRST_STEP * np.diag(unit)))
-    simplex[:, :] = np.clip(simplex, [one.least for one in ranges], [one.largest for one in ranges])
+    steps = np.vstack((np.zeros(len(names)), FIRST_STEP * np.diag(unit)))
+    least = [one.least for one in ranges]
+    largest = [one.largest for one in ranges]
+    simplex = np.clip(start + steps, least, largest)
 
     def cost_in_units(values: FloatArray) -> float:
         return cost(values * unit)
@@ -63,7 +65,9 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
         method="Nelder-Mead",
         options={"initial_simplex": simplex / unit, "maxfev": MOST_TRIALS, "xatol": CLOSE_ENOUGH, "fatol": 0.1},
     )
-    return changed(found.x * unit) if found.fun < cost(start) else effect
+    if found.fun >= cost(start):
+        return effect
+    return changed(found.x * unit)
 
 
 def _units(effect: Effect, start: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError
 from drivers.simulation.hub import HOST, Hub
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends, same
+from tests.drivers.raw_client import raw_client
 from tests.drivers.scripted import FakeClock
 
 LONG_S = 2.0  #: A step of the clock, and so the wait that it led to
@@ -237,17 +238,6 @@ HOSTILE_FRAMES = (
 """Lines of any length and of any content, whole messages of the protocol all of them."""
 
 
-@contextmanager
-def _raw_client(hub: Hub) -> Iterator[socket.socket]:
-    """Open a connection in raw mode that sends what a test writes."""
-    with socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
-        client.sendall(b"< open can0 >< rawmode >")
-        heard = b""
-        while heard != b"< hi >< ok >< ok >":
-            heard += client.recv(256)
-        yield client
-
-
 def _arrives_alone(hub: Hub, ends: Sequence[can.BusABC]) -> None:
     """Send a frame from the first end to the second: it is the next one, and the hub answers in time."""
     frame = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x2a")
@@ -259,7 +249,7 @@ def _arrives_alone(hub: Hub, ends: Sequence[can.BusABC]) -> None:
 def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
     with Hub(("can0",)) as hub:
         ends = [open_bus(hub.address()) for _ in range(2)]
-        with _raw_client(hub) as hostile:
+        with raw_client(hub) as hostile:
             hostile.sendall(line)
             hostile.settimeout(WAIT_S)
             with suppress(ConnectionResetError):  # the hub may hang up on it, and on no other client
@@ -279,7 +269,7 @@ def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
 def test_a_frame_that_arrives_is_one_that_a_bus_carries(lines: list[bytes]) -> None:
     with Hub(("can0",)) as hub:
         listening = open_bus(hub.address())
-        with _raw_client(hub) as hostile:
+        with raw_client(hub) as hostile:
             hostile.sendall(b"".join(lines) + b"><>< echo >")
             heard = b""
             while not heard.endswith(b"< echo >") and (chunk := hostile.recv(4096)):
@@ -294,7 +284,7 @@ def test_an_unfinished_line_holds_up_no_other(unfinished: bytes) -> None:
     """The hub reads each byte a bounded number of times: these took it minutes, and no other client was served."""
     with Hub(("can0",)) as hub:
         ends = [open_bus(hub.address()) for _ in range(2)]
-        with _raw_client(hub) as hostile, suppress(ConnectionResetError, BrokenPipeError):
+        with raw_client(hub) as hostile, suppress(ConnectionResetError, BrokenPipeError):
             hostile.sendall(unfinished)
             while hostile.recv(4096):
                 pass

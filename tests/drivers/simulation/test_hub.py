@@ -6,32 +6,20 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
 import can
 import pytest
 
 from drivers.canopen.bus import open_bus
-from drivers.simulation.hub import BACKLOG_BYTES, FULL_BYTES, HOST, Hub
+from drivers.simulation.hub import BACKLOG_BYTES, FULL_BYTES, Hub
+from tests.drivers.raw_client import raw_client
 
 WAIT_S = 30.0
 FLOOD_BYTES = 20_000_000
 FRAME = b"< send 123 8 01 02 03 04 05 06 07 08 >"
 LINES = 1000  #: in one write
-
-
-@contextmanager
-def raw_client(hub: Hub) -> Iterator[socket.socket]:
-    """Open a connection in raw mode that reads nothing more by itself."""
-    with socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
-        client.sendall(b"< open can0 >< rawmode >")
-        heard = b""
-        while heard != b"< hi >< ok >< ok >":
-            heard += client.recv(256)
-        yield client
-        with suppress(OSError):
-            client.shutdown(socket.SHUT_RDWR)  # a thread that waits in a write of it goes on
 
 
 class Flood(threading.Thread):
