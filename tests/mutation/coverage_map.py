@@ -17,7 +17,7 @@ import coverage
 from tests.mutation.contexts import DURATIONS_VARIABLE
 from tests.studies.output import print_line
 
-FAST = "not processes and not slow and not browser and not vcan"
+FAST = "not processes and not slow"
 """Tests of `make test`: those that a developer runs."""
 
 
@@ -114,7 +114,7 @@ def _measure(tree: Path, folder: Path, room: str) -> str:
     command += ["-m", "pytest", "-q", "-p", "tests.mutation.contexts", "-p", "no:cacheprovider", "-m", FAST, room]
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in (0, NO_TESTS_WERE_COLLECTED):
-        raise RuntimeError(f"without any fault, tests of {room} fail:\n{done.stdout[-3000:]}")
+        raise RuntimeError(f"without any fault, tests of {room} fail:\n{done.stdout[-3000:]}\n{done.stderr[-1000:]}")
     durations.with_suffix(".part").rename(durations)
     return room
 
