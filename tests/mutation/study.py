@@ -214,13 +214,12 @@ def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
 
 
 def _tree_of_head(folder: Path) -> Path:
-    """Copy of what is committed, where faults can be planted."""
+    """Clone of what is committed, where faults can be planted: some tests ask git for the files."""
     if not folder.exists():
         part = folder.with_suffix(".part")
         shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-        archive = subprocess.run(["git", "archive", "HEAD"], cwd=CHECKOUT, capture_output=True, check=True)
-        subprocess.run(["tar", "-x"], cwd=part, input=archive.stdout, check=True)
+        part.parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run(["git", "clone", "--quiet", "--local", str(CHECKOUT), str(part)], check=True)
         part.rename(folder)
     return folder
 
