@@ -21,6 +21,10 @@ FAST = "not processes and not slow"
 """Tests of `make test`: those that a developer runs."""
 
 
+NOT_OF_BEHAVIOUR = ("contracts", "data", "mutation", "pages", "vcan")
+"""Folders of tests that judge sources and pages, or need a bus that is not on every machine."""
+
+
 @dataclass(frozen=True, slots=True)
 class CoverageMap:
     """Tests that execute each line of the product.
@@ -78,7 +82,7 @@ def test_rooms(tree: Path) -> tuple[str, ...]:
     """Folders of tests two levels deep, such as `tests/ident/model`, and files between them."""
     rooms: list[str] = []
     for package in sorted((tree / "tests").iterdir()):
-        if not package.is_dir() or package.name in ("vcan", "pages", "data", "mutation"):
+        if not package.is_dir() or package.name in NOT_OF_BEHAVIOUR:
             continue
         rooms.extend(_rooms_of(tree, package))
     return tuple(rooms)

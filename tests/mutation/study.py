@@ -2,7 +2,7 @@
 
 `make mutation-study SEED=1 MUTANTS=300 MINUTES=55` goes on where it ended. A fault is tried with the tests of its own
 room that execute its line first (*mirrored*), and with the other tests that execute it where those pass. Rows go to
-docs/evidence/data/mutants-SEED.csv.
+a file for each seed beside the other evidence.
 """
 
 from __future__ import annotations
