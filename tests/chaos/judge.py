@@ -156,6 +156,9 @@ UNREACHABLE = {
 """Faults after which a drive may have other settings if a message names it: it or the bus did not answer for a time."""
 NOT_RESTORED = re.compile(r"settings (?:of .{1,200}? )?not restored.*?switch these drives off")
 MAY_BE_SILENT = {Inside.SILENT, Act.NMT, Act.CELL_KILL, Act.CELL_INT, Act.LINK_DOWN}
+FOREIGN_MASTERS = {Inside.SECOND_MASTER, Inside.SDO_MASTER}
+"""Faults of the cell that may last on after the recorder's end: a scan that finds them refuses, and says so."""
+FOREIGN = "that we did not send"
 GONE = {Act.CELL_KILL, Act.CELL_INT, Act.LINK_DOWN}
 """Faults after which there may be no cell any more."""
 GAIN = re.compile(r"^(\s*gain:\s*)(\S+)", re.MULTILINE)
@@ -292,7 +295,11 @@ def judge_end(outcome: Round) -> None:
     if outcome.silent and not kinds & MAY_BE_SILENT:
         say(f"(d) nodes {outcome.silent} do not answer any more")
     if outcome.scanned is not None and outcome.scanned[0] != ExitCode.OK and not kinds & MAY_BE_SILENT:
-        say(f"(d) scan ended with {outcome.scanned[0]} afterwards: {outcome.scanned[1]}")
+        scan_code, scan_said = outcome.scanned
+        # A fault of the cell counts cycles, and none passes between the recorder's end and the scan.
+        refused_master = scan_code == ExitCode.DEVICE_FAULT and FOREIGN in scan_said
+        if not (refused_master and kinds & FOREIGN_MASTERS):
+            say(f"(d) scan ended with {scan_code} afterwards: {scan_said}")
 
 
 def judge_code(outcome: Round) -> None:

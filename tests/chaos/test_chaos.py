@@ -155,6 +155,10 @@ def changed(kind: Act | Inside = Act.EMCY, **fields: object) -> Callable[[], Rou
         (changed(Act.DISK_FULL, code=1), ""),
         (changed(silent=[1]), "(d) nodes [1] do not answer"),
         (changed(scanned=(5, "no")), "(d) scan ended with 5"),
+        (changed(scanned=(5, "a SYNC (080h) that we did not send")), "(d) scan ended with 5"),
+        (changed(Inside.SECOND_MASTER, scanned=(5, "no answer")), "(d) scan ended with 5"),
+        (changed(Inside.SECOND_MASTER, scanned=(5, "a SYNC (080h) that we did not send")), ""),
+        (changed(Inside.SDO_MASTER, scanned=(5, "an SDO request that we did not send")), ""),
     ],
 )
 def test_each_condition_on_the_end_is_judged(made: Callable[[], Round], expected: str) -> None:

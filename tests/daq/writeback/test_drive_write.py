@@ -249,9 +249,9 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
                 simulation.nodes[2].nmt = NmtState.STOPPED
 
         _after_gain(monkeypatch, stop)
-        with pytest.raises(
-            ParametersMixed, match=r"J3 \(node 3\): object 2003h:01: the node does not answer"
-        ) as caught:
+        # Where the host is late, the search for silent nodes can end before this node counts as one.
+        silent = r"the node does not answer|no answer within 0\.3 s, asked 3 times"
+        with pytest.raises(ParametersMixed, match=rf"J3 \(node 3\): object 2003h:01: ({silent})") as caught:
             _write(cell, address)
         assert caught.value.restored == ("J1", "J2")
         assert isinstance(caught.value.__cause__, ObjectAccessError)
