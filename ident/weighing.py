@@ -230,7 +230,8 @@ def rows_to_weigh(
             made.append(differentiate(replace(run, payload=None), model.drive_train, conditioning))
         return made
 
-    without, mounted = prepared(bare), prepared(loaded)
+    without = prepared(bare)
+    mounted = prepared(loaded)
     if not mounted:
         raise DataUnfit("", "no run with the body to weigh was given; expected at least one")
     return _rows_of(model, (*without, *mounted), len(without), conditioning)
@@ -259,73 +260,190 @@ def _corrected(given: RowsToWeigh, corrections: tuple[PlacedEffect, ...]) -> Row
     return _rows_of(model, datasets, given.bare, given.rows.conditioning)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _CalibratedRobot:
+    """What a calibration says of the robot, in the order of the columns that a body is weighed with."""
+
+    model: Model  #: with the calibration's corrections of the geometry
+    gains: FloatArray  #: shape (m,)
+    standard: FloatArray  #: χ, shape (p,)
+    effects: tuple[PlacedEffect, ...]  #: those that correct the geometry are in `model`, and zero here
+    coefficients: tuple[FloatArray, ...]  #: c of each effect
+    session_began_s: float | None
+
+    @property
+    def values(self) -> FloatArray:
+        """Value of each column: χ, the body's ten as zeros, c; shape (p + 10 + c,)."""
+        return np.concatenate((self.standard, np.zeros(10), *self.coefficients))
+
+    @property
+    def body_columns(self) -> IntArray:
+        """Columns of the body's ten, shape (10,)."""
+        first = len(self.standard)
+        return np.arange(first, first + 10)
+
+    @property
+    def effects_depend_on_body(self) -> bool:
+        """Whether the columns of an effect are built from the torques that the model predicts."""
+        return not all(placed.effect.abscissa.is_independent_of_model for placed in self.effects)
+
+    def signals(self, datasets: Sequence[Dataset], body: FloatArray | None) -> list[Signals]:
+        """Signals that the effects are built from, one for each run; none without effects."""
+        if not self.effects:
+            return []
+        parameters = self.model.with_payload(self.standard, body)
+        made = []
+        for data in datasets:
+            of_robot = declared_signals(self.model, data, parameters, self.gains, self.session_began_s)
+            made.append(beside_rotors(of_robot, list(self.effects)))
+        return made
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """Least-squares solution of the motors' equations, for one set of effect columns."""
+
+    rows: Observation  #: with the columns of the effects
+    system: System  #: of all columns
+    free_system: System  #: of the free columns, with the others at their values
+    unknowns: IntArray  #: columns of the unknowns
+    free: tuple[int, ...]  #: the independent ones of them, in order
+    blurred: tuple[int, ...]  #: those of the body that gather others of its parameters
+    fixed: tuple[int, ...]  #: all other columns
+    parameters: FloatArray  #: of the free columns
+    noise: FloatArray  #: σ of each motor's residual current, shape (m,)
+    values: FloatArray  #: of all columns
+
+
 def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     """Weigh the body with rows that are at hand; errors are those of `weigh`."""
     given = _corrected(given, corrections_of(calibration))
-    model, standard = given.model, standard_parameters(calibration, given.model)
-    gains = np.array([gain.value for gain in calibration.gains])
-    effects = [left_of(*placed_effect(accepted, calibration)) for accepted in calibration.effects]
-    known = np.concatenate((standard, np.zeros(10), *(coefficients for _, coefficients in effects)))
-    ten = np.arange(len(standard), len(standard) + 10)
-    depends = not all(placed.effect.abscissa.is_independent_of_model for placed, _ in effects)
-    without, mounted = given.datasets[: given.bare], given.datasets[given.bare :]
+    robot = _robot_of(calibration, given.model)
+    solution = _solved(robot, given)
+    gains = robot.gains
+    motor_count = len(gains)
+    ten = robot.body_columns
+    free = solution.free
+    body = solution.values[ten]
+    is_of_body = np.isin(free, ten)
+    is_shown = np.isin(ten, free)
 
-    def signals(datasets: Sequence[Dataset], body: FloatArray | None) -> list[Signals]:
-        whole = model.with_payload(standard, body)
-        began_s = calibration.session_began_s
-        if not effects:
-            return []
-        placed = [effect for effect, _ in effects]
-        return [beside_rotors(declared_signals(model, data, whole, gains, began_s), placed) for data in datasets]
+    jackknifed = jackknife_covariance(
+        solution.free_system, gains, solution.parameters, solution.noise, gains_fixed=True
+    )
+    of_free = jackknifed[motor_count:, motor_count:]
+    of_moves = np.zeros((10, 10))
+    of_moves[np.ix_(is_shown, is_shown)] = of_free[np.ix_(is_of_body, is_of_body)]
 
-    bare, body = signals(without, None), np.zeros(10)
-    for _ in range(MAX_PASSES if depends else 1):
-        rows, runs = given.rows, (*bare, *signals(mounted, body))
-        for placed, _ in effects:
-            torque = effect_torque(placed.effect, placed.axis, runs, given.datasets, rows.conditioning, model)
-            rows = rows.extended(placed.columns, torque)
-        system = rows.system()
-        unknowns, free, blurred = _unknowns(system, ten, model, beside_bare_runs=given.bare > 0)
-        held = [index for index in range(len(known)) if index not in free]
-        unknown = system.holding({i: float(known[i]) for i in held})
-        parameters, noise = unknown.currents.settled(gains, len(free))
-        found = known.copy()
-        found[list(free)] = parameters
-        before, body = body, found[ten]
-        if np.linalg.norm(body - before) <= STAYS * np.linalg.norm(body):
-            break
-    count, own = len(gains), np.isin(free, ten)
-    shown = np.isin(ten, free)
-    moves = jackknife_covariance(unknown, gains, parameters, noise, gains_fixed=True)[count:, count:]
-    seen = system.motors.rows > 0
-    weight = 1.0 / (gains * noise)
+    system = solution.system
+    weight = 1.0 / (gains * solution.noise)
+    has_moved = system.motors.rows > 0
     # A motor that never moved is as noisy as the others, should further moves need it.
-    weight[~seen] = np.median(np.abs(weight[seen]))
+    weight[~has_moved] = np.median(np.abs(weight[has_moved]))
     whitened = system.currents.whitened(gains, 1.0 / (gains * weight))
     columns = whitened.linear
-    right = np.concatenate((whitened.drive, -columns[:, held]), axis=1)
-    slope = np.zeros((10, count + len(held)))
-    slope[shown] = solve(columns[:, list(free)], right)[0][own]
-    of_moves = np.zeros((10, 10))
-    of_moves[np.ix_(shown, shown)] = moves[np.ix_(own, own)]
-    names = [rows.columns[index].name for index in held]
-    unseen = np.where(shown & ~np.isin(ten, blurred), 0.0, np.nan)
-    on_body = given.loaded
-    regressor = np.concatenate((rows.regressor, rows.effects), axis=1)
-    predicted = np.einsum("jpr,p->jr", regressor[:, :, on_body], found)
-    of_calibration = _of_calibration(calibration, gains, slope, names)
-    of_reference = _of_reference_mass(calibration, body, slope, names)
-    unseen_pair = unseen + unseen[:, None]
+
+    # ∂p/∂(g, fixed parameters): each moves the body by what it moves the right-hand side.
+    right_hand_sides = np.concatenate((whitened.drive, -columns[:, list(solution.fixed)]), axis=1)
+    free_slope = solve(columns[:, list(free)], right_hand_sides)[0]
+    slope = np.zeros((10, motor_count + len(solution.fixed)))
+    slope[is_shown] = free_slope[is_of_body]
+    fixed_names = [solution.rows.columns[index].name for index in solution.fixed]
+    of_calibration = _of_calibration(calibration, gains, slope, fixed_names)
+    of_reference = _of_reference_mass(calibration, body, slope, fixed_names)
+
+    is_separate = is_shown & ~np.isin(ten, solution.blurred)
+    nan_where_unseen = np.where(is_separate, 0.0, np.nan)
+    nan_pairs = nan_where_unseen + nan_where_unseen[:, None]
+    unknown_columns = columns[:, solution.unknowns]
     return WeighedBody(
-        values=body + unseen,
-        moves_covariance=of_moves + unseen_pair,
-        covariance=of_moves + of_calibration + of_reference + unseen_pair,
+        values=body + nan_where_unseen,
+        moves_covariance=of_moves + nan_pairs,
+        covariance=of_moves + of_calibration + of_reference + nan_pairs,
         complete=calibration.covariance_factor is not None,
         moves=len(system.clusters),
-        error=relative_error(rows.torque(gains, on_body), predicted, rows.use[:, on_body]),
-        scale=Scale(model, unknowns, weight, columns[:, unknowns].T @ columns[:, unknowns], given.bare > 0),
-        reference_covariance=of_reference + unseen_pair,
+        error=_error_with_body(solution, given.loaded, gains),
+        scale=Scale(
+            model=given.model,
+            unknowns=solution.unknowns,
+            weight=weight,
+            information=unknown_columns.T @ unknown_columns,
+            beside_bare_runs=given.bare > 0,
+        ),
+        reference_covariance=of_reference + nan_pairs,
     )
+
+
+def _robot_of(calibration: Calibration, model: Model) -> _CalibratedRobot:
+    effects = []
+    coefficients = []
+    for accepted in calibration.effects:
+        placed, values = left_of(*placed_effect(accepted, calibration))
+        effects.append(placed)
+        coefficients.append(values)
+    return _CalibratedRobot(
+        model=model,
+        gains=np.array([gain.value for gain in calibration.gains]),
+        standard=standard_parameters(calibration, model),
+        effects=tuple(effects),
+        coefficients=tuple(coefficients),
+        session_began_s=calibration.session_began_s,
+    )
+
+
+def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _Solution:
+    """Solve for the body, again and again while its torques change the columns of the effects."""
+    without_body = given.datasets[: given.bare]
+    with_body = given.datasets[given.bare :]
+    bare_signals = robot.signals(without_body, None)
+    passes = MAX_PASSES if robot.effects_depend_on_body else 1
+    body = np.zeros(10)
+    for _ in range(passes):
+        signals = (*bare_signals, *robot.signals(with_body, body))
+        solution = _solved_with(robot, given, signals)
+        previous_body = body
+        body = solution.values[robot.body_columns]
+        change = np.linalg.norm(body - previous_body)
+        if change <= STAYS * np.linalg.norm(body):
+            break
+    return solution
+
+
+def _solved_with(robot: _CalibratedRobot, given: RowsToWeigh, signals: Sequence[Signals]) -> _Solution:
+    """Solve for the body, with the columns of the effects from these signals."""
+    rows = given.rows
+    for placed in robot.effects:
+        torque = effect_torque(placed.effect, placed.axis, signals, given.datasets, rows.conditioning, robot.model)
+        rows = rows.extended(placed.columns, torque)
+    system = rows.system()
+    values = robot.values
+    unknowns, free, blurred = _unknowns(system, robot.body_columns, robot.model, beside_bare_runs=given.bare > 0)
+    fixed = tuple(index for index in range(len(values)) if index not in free)
+    free_system = system.holding({index: float(values[index]) for index in fixed})
+    parameters, noise = free_system.currents.settled(robot.gains, len(free))
+    values[list(free)] = parameters
+    return _Solution(
+        rows=rows,
+        system=system,
+        free_system=free_system,
+        unknowns=unknowns,
+        free=free,
+        blurred=blurred,
+        fixed=fixed,
+        parameters=parameters,
+        noise=noise,
+        values=values,
+    )
+
+
+def _error_with_body(solution: _Solution, is_loaded: BoolArray, gains: FloatArray) -> RelativeError:
+    """Relative error of the torques on the rows that carried the body."""
+    rows = solution.rows
+    regressor = np.concatenate((rows.regressor, rows.effects), axis=1)
+    # τ_jr = Σ_p W_jpr χ_p
+    predicted = np.einsum("jpr,p->jr", regressor[:, :, is_loaded], solution.values)
+    measured = rows.torque(gains, is_loaded)
+    return relative_error(measured, predicted, rows.use[:, is_loaded])
 
 
 def _unknowns(

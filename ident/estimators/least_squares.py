@@ -87,22 +87,31 @@ def _deviation(size: float, factor: FloatArray, freedom: int) -> float:
 
 
 def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray | None) -> Estimate:
-    count, triangles = system.axis_count, system.joints
+    count = system.axis_count
+    triangles = system.joints
     stacked = triangles.stacked(weight)
     if fixed is None:
         require_known_payload(system)
-        matrix, right = stacked[:, :-1], -stacked[:, -1]
+        matrix = stacked[:, :-1]
+        right = -stacked[:, -1]
+        first_estimated = 0
     else:
-        matrix, right = -stacked[:, count:-1], stacked[:, :count] @ fixed + stacked[:, -1]
+        matrix = -stacked[:, count:-1]
+        right = stacked[:, :count] @ fixed + stacked[:, -1]
+        first_estimated = count
     solution, inverse = solve(matrix, right)
-    full = np.concatenate((solution, [1.0])) if fixed is None else np.concatenate((fixed, solution, [1.0]))
+    if fixed is None:
+        full = np.concatenate((solution, [1.0]))
+    else:
+        full = np.concatenate((fixed, solution, [1.0]))
     rows = int(triangles.rows.sum())
+    unknown_count = matrix.shape[1]
     # Eq. (9) on the weighted rows, then eq. (10).
-    variance = float(np.sum((stacked @ full) ** 2)) / max(rows - matrix.shape[1], 1)
+    squares = float(np.sum((stacked @ full) ** 2))
+    variance = squares / max(rows - unknown_count, 1)
     covariance = np.zeros((len(full) - 1, len(full) - 1))
-    first = 0 if fixed is None else count
-    covariance[first:, first:] = variance * inverse
-    weighted = system.weighted_singular_values(full, matrix.shape[1], gains=fixed is None)
+    covariance[first_estimated:, first_estimated:] = variance * inverse
+    weighted = system.weighted_singular_values(full, unknown_count, gains=fixed is None)
     return Estimate(
         method=method,
         gains=full[:count],
@@ -110,7 +119,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
         unknowns=system.unknowns,
         parameters=full[count:-1],
         covariance=covariance,
-        axis_noise=triangles.residual_std(full, matrix.shape[1]),
+        axis_noise=triangles.residual_std(full, unknown_count),
         singular_values=singular_values(matrix),
         condition=float(weighted[0] / weighted[-1]),
         rows=rows,
@@ -208,9 +217,12 @@ def parameters_over_noise(system: System) -> FloatArray:
     for factor in system.joints.factors:
         own = independent_columns(factor, smallest=NO_COLUMN)
         parameters = [column for column in own if column >= system.axis_count]
-        of_all = singular_values(factor[:, own]).min(initial=np.inf)
-        of_parameters = singular_values(factor[:, parameters]).min(initial=np.inf)
-        ratios.append(of_parameters / of_all if np.isfinite(of_all) else np.inf)
+        smallest_of_all = singular_values(factor[:, own]).min(initial=np.inf)
+        smallest_of_parameters = singular_values(factor[:, parameters]).min(initial=np.inf)
+        ratio = np.inf
+        if np.isfinite(smallest_of_all):
+            ratio = smallest_of_parameters / smallest_of_all
+        ratios.append(ratio)
     return np.array(ratios)
 
 

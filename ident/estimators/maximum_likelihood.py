@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.equations.currents import Currents
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.system import System, require_known_payload, require_rows
 from ident.errors import DataUnfit, NotConverged, RankDeficient
@@ -80,9 +81,11 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
     if fixed_gains is None:
         require_known_payload(system)
         gains, iterations = _gauss_newton(system)
+        free = len(system.unknowns) + system.axis_count
     else:
-        gains, iterations = fixed_gains, 0
-    free = len(system.unknowns) + (0 if fixed_gains is not None else system.axis_count)
+        gains = fixed_gains
+        iterations = 0
+        free = len(system.unknowns)
     parameters, noise = system.currents.settled(gains, free)
     full = np.concatenate((gains, parameters, [1.0]))
     weighted = system.weighted_singular_values(full, free, gains=fixed_gains is None)
@@ -106,47 +109,69 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
 
 def _gauss_newton(system: System) -> tuple[FloatArray, int]:
     """Gains by variable projection: χ is eliminated for each of them, so that only m unknowns are iterated."""
-    count, currents = system.axis_count, system.currents
-    # Start from the linear estimate under which the data are most likely. Each of them is the best on some data.
-    starts = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
-    candidates = [one.gains for one in starts if np.all(np.isfinite(one.gains)) and np.all(one.gains != 0.0)]
-    if not candidates:
-        names = tuple(f"gain {motor + 1}" for motor in range(count))
-        raise RankDeficient("no linear estimate gives every gain a value", names)
-    even = np.ones(count)
-    gains = min(candidates, key=lambda one: currents.cost(one, currents.whitened(one, even).parameters(one), even))
-    noise = np.ones(count)
+    currents = system.currents
+    gains = _start(system)
+    noise = np.ones(system.axis_count)
     for _ in range(3):
         parameters = currents.whitened(gains, noise).parameters(gains)
         noise = currents.noise(gains, parameters, 0, noise)
-    cost = [currents.cost(gains, parameters, noise)]
+    costs = [currents.cost(gains, parameters, noise)]
     damping = 1e-3
     for iteration in range(1, MAX_ITERATIONS + 1):
-        whitened = currents.whitened(gains, noise)
-        parameters = whitened.parameters(gains)
-        residual = whitened.residual(gains, parameters)
-        # Relative steps of 1/g, so that motors of different units are alike.
-        columns = currents.corrected(gains, noise, whitened, residual) * gains
-        q, _ = np.linalg.qr(whitened.linear / np.linalg.norm(whitened.linear, axis=0))
-        projected = columns - q @ (q.T @ columns)
-        gram, gradient = projected.T @ projected, projected.T @ residual
+        gram, gradient = _projected_equations(currents, gains, noise)
         # Judged before damping: a step made small by damping alone is a failure, not an optimum.
-        step = float(np.max(np.abs(np.linalg.lstsq(gram, gradient, rcond=None)[0])))
+        undamped = np.linalg.lstsq(gram, gradient, rcond=None)[0]
+        step = float(np.max(np.abs(undamped)))
         if step < STEP_TOLERANCE:
             return gains, iteration
         while True:
-            relative = np.linalg.solve(gram + damping * np.diag(np.diag(gram)), gradient)
+            damped_gram = gram + damping * np.diag(np.diag(gram))
+            relative = np.linalg.solve(damped_gram, gradient)
             trial = gains / (1.0 + relative)
             if np.all(np.sign(trial) == np.sign(gains)):
-                candidate = currents.whitened(trial, noise).parameters(trial)
-                trial_cost = currents.cost(trial, candidate, noise)
-                if trial_cost <= cost[-1] + 1e-12 * abs(cost[-1]):
+                parameters = currents.whitened(trial, noise).parameters(trial)
+                trial_cost = currents.cost(trial, parameters, noise)
+                if trial_cost <= costs[-1] + 1e-12 * abs(costs[-1]):
                     break
             damping *= 10.0
             if damping > LARGEST_DAMPING:
-                raise NotConverged("ml", iteration, tuple(cost), step)
-        gains, damping = trial, max(damping * 0.1, 1e-12)
+                raise NotConverged("ml", iteration, tuple(costs), step)
+        gains = trial
+        damping = max(damping * 0.1, 1e-12)
         if iteration <= NOISE_ITERATIONS:
-            noise = currents.noise(gains, candidate, 0, noise)
-        cost.append(currents.cost(gains, candidate, noise))
-    raise NotConverged("ml", MAX_ITERATIONS, tuple(cost), step)
+            noise = currents.noise(gains, parameters, 0, noise)
+        costs.append(currents.cost(gains, parameters, noise))
+    raise NotConverged("ml", MAX_ITERATIONS, tuple(costs), step)
+
+
+def _start(system: System) -> FloatArray:
+    """Gains of the linear estimate under which the data are most likely: each of them is the best on some data."""
+    currents = system.currents
+    even = np.ones(system.axis_count)
+
+    def cost(gains: FloatArray) -> float:
+        parameters = currents.whitened(gains, even).parameters(gains)
+        return currents.cost(gains, parameters, even)
+
+    estimates = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
+    usable = []
+    for estimate in estimates:
+        if np.all(np.isfinite(estimate.gains)) and np.all(estimate.gains != 0.0):
+            usable.append(estimate.gains)
+    if not usable:
+        names = tuple(f"gain {motor + 1}" for motor in range(system.axis_count))
+        raise RankDeficient("no linear estimate gives every gain a value", names)
+    return min(usable, key=cost)
+
+
+def _projected_equations(currents: Currents, gains: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of relative steps of 1/g, with χ projected out; shapes (m, m) and (m,)."""
+    whitened = currents.whitened(gains, noise)
+    parameters = whitened.parameters(gains)
+    residual = whitened.residual(gains, parameters)
+    # Relative steps of 1/g, so that motors of different units are alike.
+    columns = currents.corrected(gains, noise, whitened, residual) * gains
+    unit_columns = whitened.linear / np.linalg.norm(whitened.linear, axis=0)
+    q, _ = np.linalg.qr(unit_columns)
+    projected = columns - q @ (q.T @ columns)
+    return projected.T @ projected, projected.T @ residual

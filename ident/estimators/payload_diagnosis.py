@@ -6,7 +6,7 @@ Where the declared masses of several payloads contradict each other, these are n
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
@@ -73,9 +73,9 @@ def payload_diagnoses(
         f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's torque, its mass by "
         f"{worst.difference[9]:+.2g} kg (by chance with p = {worst.probability:.0e})"
     )
-    expected = "the same body, mounted in the same way, in all runs that say so" + "; one of these runs" * (
-        len(runs) > 1
-    )
+    expected = "the same body, mounted in the same way, in all runs that say so"
+    if len(runs) > 1:
+        expected += "; one of these runs"
     remedy = "was it mounted in this run, and not turned? give each way of mounting a name of its own"
     if held is not None and worst.share > WRONG_SHARE:
         raise PayloadDiffers(f"run {', '.join(runs)}", found=evidence, expected=expected, remedy=remedy)
@@ -126,101 +126,209 @@ def payload_differences(
         differences above LEAST_SHARE of the payload's torque, and less probable than LARGEST_PROBABILITY.
     """
     leading = len(system.base.independent)
-    if not system.payloads or tuple(column.name for column in system.columns[:leading]) != system.base.names:
+    leading_names = tuple(column.name for column in system.columns[:leading])
+    if not system.payloads or leading_names != system.base.names:
         return []  # parameters were taken out, and the flange's columns with them
-    count = system.axis_count
-    of_base = system.base.grouping[:, system.model.flange]
-    noise = system.currents.noise(gains, parameters)
-    first, least = (held, LEAST_SHARE) if held is not None else (count + len(parameters), UNSEEN_SHARE)
-    blocks = []  # J, e and X of each move
-    for index, cluster in enumerate(system.clusters):
-        parts = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
-        jacobian, residual, _ = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        if system.model.is_redundant:
-            currents = PreloadedCurrents.of_rows(list(cluster), system.preload_of(index))
-            weight = [currents.whitened(gains, noise).known]
-        else:
-            weight = [rows[:, -1] / (g * std) for rows, g, std in zip(cluster, gains, noise, strict=True)]
-        # With given gains, which may all be off, the weight of the payload is an unknown of all runs together.
-        others = np.column_stack((jacobian[:, first:], np.concatenate(weight))) if held else jacobian[:, first:]
-        blocks.append((others, residual, jacobian[:, count : count + leading] @ of_base))
-    norms = np.sqrt(np.sum([np.sum(jacobian**2, axis=0) for jacobian, _, _ in blocks], axis=0))
-    blocks = [(jacobian / np.where(norms > 0.0, norms, 1.0), e, x) for jacobian, e, x in blocks]
-    gram = np.sum([jacobian.T @ jacobian for jacobian, _, _ in blocks], axis=0)
-    score = np.sum([jacobian.T @ e for jacobian, e, _ in blocks], axis=0)
-    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) if len(gram) else gram
-    total = float(np.sum([np.sum(e**2) for _, e, _ in blocks]))
+    if held is None:
+        first_unknown = system.axis_count + len(parameters)
+        least_share = UNSEEN_SHARE
+    else:
+        first_unknown = held
+        least_share = LEAST_SHARE
+    moves = _normalised(_move_equations(system, gains, parameters, first_unknown, with_weight=bool(held)))
+    fit = _normal_equations(moves)
     found: list[PayloadDifference] = []
-    for run, name in enumerate(system.runs):
-        inside = [index for index, (owner, _) in enumerate(system.cluster_runs) if owner == run]
-        if len(inside) < MIN_MOVES_TO_LEAVE_OUT:
-            continue
-        flange = np.concatenate([blocks[index][2] for index in inside]) * OF_A_BODY
-        cross = np.sum([blocks[index][2].T @ blocks[index][0] for index in inside], axis=0) * OF_A_BODY[:, None]
-        own = np.sum([blocks[index][2].T @ blocks[index][1] for index in inside], axis=0) * OF_A_BODY
-        visible, directions = np.linalg.eigh(flange.T @ flange - cross @ inverse @ cross.T)
-        alone = np.sum((flange @ directions) ** 2, axis=0)
-        kept = np.flatnonzero((visible > SEEN * alone) & (visible > 1e-9 * visible[-1]))[
-            -(len(inside) // LEAST_MOVES) :
-        ]
-        if not len(kept):
-            continue
-        directions = directions[:, kept]
-        amount = directions.T @ (own - cross @ (inverse @ score)) / visible[kept]
-        seen = directions * OF_A_BODY[:, None]
-        mounting = system.cluster_runs[inside[0]][1]
-        body = _payload_parameters(system, parameters)[max(0, mounting)]  # without load, relative to the first payload
-        torque = float(np.linalg.norm(flange @ (seen @ amount / OF_A_BODY)))
-        share = torque / float(np.linalg.norm(flange @ (body / OF_A_BODY)))
-        left = float(np.linalg.norm(np.concatenate([blocks[index][1] for index in inside])))
-        if share < least or torque < LEAST_OF_RESIDUAL * left:
-            continue
-        probability = _chance(blocks, inside, seen, amount, inverse @ (score - cross.T @ (directions @ amount)))
-        if probability * len(system.runs) < LARGEST_PROBABILITY:
-            explained = float(np.sum(visible[kept] * amount**2))
-            is_loaded = mounting >= 0
-            found.append(PayloadDifference(name, seen @ amount, share, probability, is_loaded, 1.0 - explained / total))
+    for run in range(len(system.runs)):
+        difference = _difference_in(system, run, moves, fit, parameters, least_share)
+        if difference is not None:
+            found.append(difference)
     return found
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _MoveEquations:
+    """Linearised equations e = J x + X δ of the rows of one move, each divided by its σ."""
+
+    jacobian: FloatArray  #: J, derivative to the unknowns of all runs, shape (r, f)
+    residual: FloatArray  #: e, shape (r,)
+    flange: FloatArray  #: X, derivative to the ten parameters of the body, shape (r, 10)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _NormalEquations:
+    """Normal equations of all moves together, without δ."""
+
+    inverse: FloatArray  #: (JᵀJ)⁻¹, shape (f, f)
+    score: FloatArray  #: Jᵀe, shape (f,)
+    squares: float  #: eᵀe
+
+
+def _move_equations(
+    system: System, gains: FloatArray, parameters: FloatArray, first_unknown: int, *, with_weight: bool
+) -> list[_MoveEquations]:
+    """Equations of each move; arguments as for `payload_differences`.
+
+    Args:
+        first_unknown: gains and parameters before this one are no unknowns.
+        with_weight: the weight of the payload is one. With given gains, which may all be off, it is an unknown of all
+            runs together.
+    """
+    first_base = system.axis_count
+    last_base = first_base + len(system.base.independent)
+    base_to_flange = system.base.grouping[:, system.model.flange]
+    noise = system.currents.noise(gains, parameters)
+    moves = []
+    for index, cluster in enumerate(system.clusters):
+        by_motor = list(motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise))
+        jacobian = np.concatenate([of_motor[0] for of_motor in by_motor])
+        residual = np.concatenate([of_motor[1] for of_motor in by_motor])
+        unknowns = jacobian[:, first_unknown:]
+        if with_weight:
+            unknowns = np.column_stack((unknowns, _payload_column(system, index, gains, noise)))
+        flange = jacobian[:, first_base:last_base] @ base_to_flange
+        moves.append(_MoveEquations(unknowns, residual, flange))
+    return moves
+
+
+def _payload_column(system: System, index: int, gains: FloatArray, noise: FloatArray) -> FloatArray:
+    """Current of the known payloads in the rows of one move, in σ of each motor, shape (r,)."""
+    cluster = system.clusters[index]
+    if system.model.is_redundant:
+        currents = PreloadedCurrents.of_rows(list(cluster), system.preload_of(index))
+        return currents.whitened(gains, noise).known
+    by_motor = []
+    for rows, gain, std in zip(cluster, gains, noise, strict=True):
+        by_motor.append(rows[:, -1] / (gain * std))
+    return np.concatenate(by_motor)
+
+
+def _normalised(moves: Sequence[_MoveEquations]) -> list[_MoveEquations]:
+    """Equations with the columns of J divided by their norms over all moves."""
+    squares = np.sum([np.sum(move.jacobian**2, axis=0) for move in moves], axis=0)
+    norms = np.sqrt(squares)
+    norms = np.where(norms > 0.0, norms, 1.0)
+    return [replace(move, jacobian=move.jacobian / norms) for move in moves]
+
+
+def _normal_equations(moves: Sequence[_MoveEquations]) -> _NormalEquations:
+    gram = np.sum([move.jacobian.T @ move.jacobian for move in moves], axis=0)
+    score = np.sum([move.jacobian.T @ move.residual for move in moves], axis=0)
+    inverse = gram
+    if len(gram):
+        inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
+    squares = float(np.sum([np.sum(move.residual**2) for move in moves]))
+    return _NormalEquations(inverse, score, squares)
+
+
+def _difference_in(
+    system: System,
+    run: int,
+    moves: Sequence[_MoveEquations],
+    fit: _NormalEquations,
+    parameters: FloatArray,
+    least_share: float,
+) -> PayloadDifference | None:
+    """Estimate δ of one run; None where it is small or may be chance.
+
+    Args:
+        system: of the runs.
+        run: index of the run.
+        moves: of all runs, normalised.
+        fit: their normal equations.
+        parameters: of the fit, shape (p,).
+        least_share: torque of the difference that is reported, relative to the payload's.
+    """
+    inside = [index for index, (owner, _) in enumerate(system.cluster_runs) if owner == run]
+    if len(inside) < MIN_MOVES_TO_LEAVE_OUT:
+        return None
+    own_moves = [moves[index] for index in inside]
+    # XᵀX, XᵀJ and Xᵀe of this run, for a body of OF_A_BODY.
+    flange = np.concatenate([move.flange for move in own_moves]) * OF_A_BODY
+    cross = np.sum([move.flange.T @ move.jacobian for move in own_moves], axis=0) * OF_A_BODY[:, None]
+    own_score = np.sum([move.flange.T @ move.residual for move in own_moves], axis=0) * OF_A_BODY
+
+    # Directions of δ that remain visible beside all other unknowns: eigenvectors of the Schur complement.
+    visible, directions = np.linalg.eigh(flange.T @ flange - cross @ fit.inverse @ cross.T)
+    alone = np.sum((flange @ directions) ** 2, axis=0)
+    is_visible = (visible > SEEN * alone) & (visible > 1e-9 * visible[-1])
+    largest_count = len(inside) // LEAST_MOVES
+    chosen = np.flatnonzero(is_visible)[-largest_count:]
+    if not len(chosen):
+        return None
+    visible = visible[chosen]
+    directions = directions[:, chosen]
+    amount = directions.T @ (own_score - cross @ (fit.inverse @ fit.score)) / visible
+    body_per_amount = directions * OF_A_BODY[:, None]
+    difference = body_per_amount @ amount
+
+    mounting = system.cluster_runs[inside[0]][1]
+    # In a run without load, relative to the first payload.
+    body = _payload_parameters(system, parameters)[max(0, mounting)]
+    torque = float(np.linalg.norm(flange @ (difference / OF_A_BODY)))
+    share = torque / float(np.linalg.norm(flange @ (body / OF_A_BODY)))
+    residual_size = float(np.linalg.norm(np.concatenate([move.residual for move in own_moves])))
+    if share < least_share or torque < LEAST_OF_RESIDUAL * residual_size:
+        return None
+    other_unknowns = fit.inverse @ (fit.score - cross.T @ (directions @ amount))
+    probability = _chance(moves, inside, body_per_amount, amount, other_unknowns)
+    if probability * len(system.runs) >= LARGEST_PROBABILITY:
+        return None
+    explained = float(np.sum(visible * amount**2))
+    return PayloadDifference(
+        run=system.runs[run],
+        difference=difference,
+        share=share,
+        probability=probability,
+        loaded=mounting >= 0,
+        left=1.0 - explained / fit.squares,
+    )
+
+
 def _chance(
-    blocks: Sequence[tuple[FloatArray, FloatArray, FloatArray]],
+    moves: Sequence[_MoveEquations],
     inside: Sequence[int],
-    seen: FloatArray,
+    body_per_amount: FloatArray,
     amount: FloatArray,
-    others: FloatArray,
+    other_unknowns: FloatArray,
 ) -> float:
     """Probability of δ by Hotelling's T², its covariance from leaving out one move at a time.
 
     Args:
-        blocks: J, e and X of each move.
+        moves: equations of each move.
         inside: moves of the run.
-        seen: δ per unit of each of its visible directions, shape (10, q).
+        body_per_amount: δ per unit of each of its visible directions, shape (10, q).
         amount: of each of these, shape (q,).
-        others: the step of all other unknowns beside δ, shape (f,).
+        other_unknowns: their step beside δ, shape (f,).
     """
-    whole, size = np.concatenate((others, amount)), len(others) + len(amount)
-    grams, scores = np.zeros((len(blocks), size, size)), np.zeros((len(blocks), size))
+    step = np.concatenate((other_unknowns, amount))
+    other_count = len(other_unknowns)
+    size = len(step)
+    grams = np.zeros((len(moves), size, size))
+    scores = np.zeros((len(moves), size))
     members = set(inside)
-    for index, (jacobian, e, x) in enumerate(blocks):
-        columns = np.zeros((len(e), size))
-        columns[:, : len(others)] = jacobian
+    for index, move in enumerate(moves):
+        columns = np.zeros((len(move.residual), size))
+        columns[:, :other_count] = move.jacobian
         if index in members:
-            columns[:, len(others) :] = x @ seen
-        grams[index], scores[index] = columns.T @ columns, columns.T @ (e - columns @ whole)
-    shifts = left_out_shifts(grams, scores)[:, len(others) :]
+            columns[:, other_count:] = move.flange @ body_per_amount
+        grams[index] = columns.T @ columns
+        scores[index] = columns.T @ (move.residual - columns @ step)
+    shifts = left_out_shifts(grams, scores)[:, other_count:]
     centred = shifts - shifts.mean(axis=0)
-    covariance = (len(blocks) - 1) / len(blocks) * (centred.T @ centred)
-    moves, directions = len(inside), len(amount)
+    covariance = (len(moves) - 1) / len(moves) * (centred.T @ centred)
     wald = float(amount @ np.linalg.solve(covariance, amount))
-    return float(
-        scipy.special.fdtrc(directions, moves - directions, (moves - directions) / (directions * (moves - 1)) * wald)
-    )
+    # T² (n − q) / (q (n − 1)) has an F distribution with q and n − q degrees of freedom.
+    move_count = len(inside)
+    directions = len(amount)
+    freedom = move_count - directions
+    f_value = freedom / (directions * (move_count - 1)) * wald
+    return float(scipy.special.fdtrc(directions, freedom, f_value))
 
 
 def _payload_parameters(system: System, parameters: FloatArray) -> list[FloatArray]:
     """All ten of each payload, known or estimated, shape (10,)."""
-    first, bodies = len(system.columns), []
+    first = len(system.columns)
+    bodies = []
     for payload, indices in zip(system.payloads, system.payload_columns, strict=True):
         body = payload.known_parameters
         body[list(indices)] = parameters[first : first + len(indices)]
