@@ -141,9 +141,7 @@ class _Finder(ast.NodeVisitor):
     def _replace(self, kind: str, node: ast.expr | ast.stmt, after: str) -> None:
         self._add(kind, self._start(node), self._end(node), after)
 
-    def _exchange_between(
-        self, kind: str, left: ast.expr, right: ast.expr, pattern: str, after: str
-    ) -> None:
+    def _exchange_between(self, kind: str, left: ast.expr, right: ast.expr, pattern: str, after: str) -> None:
         """Replace the operator between two expressions."""
         start = self._end(left)
         between = self.source[start : self._start(right)].decode()

@@ -18,7 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from queue import Queue
@@ -229,7 +229,20 @@ def _rows_of(file: Path) -> list[Outcome]:
         return []
     with file.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    return [Outcome(**{**row, "number": int(row["number"]), "line": int(row["line"])}) for row in rows]
+    return [_outcome_of(row) for row in rows]
+
+
+def _outcome_of(row: dict[str, str]) -> Outcome:
+    return Outcome(
+        number=int(row["number"]),
+        file=row["file"],
+        line=int(row["line"]),
+        kind=row["kind"],
+        before=row["before"],
+        after=row["after"],
+        result=row["result"],
+        noticed_by=row["noticed_by"],
+    )
 
 
 def _append(file: Path, outcome: Outcome) -> None:
@@ -257,7 +270,10 @@ def _share(room: str, results: Counter[str]) -> str:
     count = results.total()
     noticed = results["mirrored"] + results["other"]
     missed = count - noticed
-    return f"{room:22s} {count:4d} mutants, noticed {noticed:4d}, by the mirrored tests {results['mirrored']:4d}, missed {missed}"
+    by_mirrored = results["mirrored"]
+    return (
+        f"{room:22s} {count:4d} mutants, noticed {noticed:4d}, by the mirrored tests {by_mirrored:4d}, missed {missed}"
+    )
 
 
 def main() -> int:
@@ -290,8 +306,10 @@ def main() -> int:
         finally:
             trees.put(tree)
 
+    waiting = [planted for planted in mutants if planted.number not in done]
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        for outcome in pool.map(work, [planted for planted in mutants if planted.number not in done]):
+        for finished in as_completed([pool.submit(work, planted) for planted in waiting]):
+            outcome = finished.result()
             if outcome is not None:
                 _append(tables, outcome)
                 print_line(f"{outcome.number:4d} {outcome.result:12s} {outcome.file}:{outcome.line} {outcome.kind}")
