@@ -46,12 +46,9 @@ class CoverageMap:
         tests = [context for context in contexts if context]
         return tuple(sorted(tests, key=lambda test: self.durations_s.get(test, 0.0)))
 
-    def tests_of_lines(self, file: str, lines: Iterator[int]) -> tuple[str, ...]:
-        """Tests that execute any of some lines, the fastest first."""
-        tests: set[str] = set()
-        for line in lines:
-            tests.update(self.tests_of(file, line))
-        return tuple(sorted(tests, key=lambda test: self.durations_s.get(test, 0.0)))
+    def runs_at_import(self, file: str, line: int) -> bool:
+        """Whether a line is executed outside of all tests: what it makes is used by tests that do not execute it."""
+        return "" in self.data.contexts_by_lineno(str(self.tree / file)).get(line, [])
 
 
 def measured_map(tree: Path, folder: Path, jobs: int) -> CoverageMap:

@@ -29,6 +29,9 @@ EXCHANGED_NAMES = {
 }
 """Functions that are called with the same arguments and mean something else."""
 
+SYMMETRIC = {"max", "min", "maximum", "minimum", "hypot", "isclose", "allclose", "array_equal", "gcd", "lcm"}
+"""Functions of two arguments whose order does not matter."""
+
 EXCHANGED_COMPARISONS = {
     ast.Lt: (r"<", "<="),
     ast.LtE: (r"<=", "<"),
@@ -276,7 +279,11 @@ class _Finder(ast.NodeVisitor):
     def _exchange_arguments(self, node: ast.Call) -> None:
         if len(node.args) < 2:
             return
-        first, second = node.args[0], node.args[1]
+        name = self._text(node.func).rsplit(".", 1)[-1]
+        if name in SYMMETRIC:
+            return
+        first = node.args[0]
+        second = node.args[1]
         if isinstance(first, ast.Starred) or isinstance(second, ast.Starred):
             return
         between = self.source[self._end(first) : self._start(second)].decode()

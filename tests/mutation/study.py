@@ -156,15 +156,17 @@ def _write(path: Path, source: bytes) -> None:
 
 def _verdict(planted: Planted, tree: Path, covered: CoverageMap) -> tuple[str, str]:
     tests = covered.tests_of(planted.file, planted.mutant.line)
+    if not tests or covered.runs_at_import(planted.file, planted.mutant.line):
+        name, noticed_by = _verdict_of_room(planted, tree)
+        if noticed_by or not tests:
+            return name, noticed_by
     own = [test for test in tests if mirrored(test, planted.file)]
     others = [test for test in tests if not mirrored(test, planted.file)]
     for name, group in (("mirrored", own), ("other", others)):
         noticed_by = _first_that_fails(group, tree, covered)
         if noticed_by:
             return name, noticed_by
-    if tests:
-        return "survived", ""
-    return _verdict_of_room(planted, tree)
+    return "survived", ""
 
 
 def _verdict_of_room(planted: Planted, tree: Path) -> tuple[str, str]:

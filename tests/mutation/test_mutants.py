@@ -57,6 +57,7 @@ def test_a_fault_of_each_kind_is_planted_at_its_place(source: str, kind: str, ch
         "__all__ = ['a', 'b']\n",
         "if TYPE_CHECKING:\n    x = 3\n",
         "@f(3)\nclass A: ...\n",
+        "x = math.isclose(a, b)\n",
     ],
 )
 def test_what_is_no_behaviour_gets_no_fault(source: str) -> None:
