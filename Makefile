@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study
+.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -63,6 +63,7 @@ help:
 	@echo "make pairs-study  gains of independent recordings of one arm beside their error bars, after the search (docs/evidence/pairs.md); resumable, hours"
 	@echo "make planner-study  error bars that the planner predicts beside those of the fit, slow noise too (docs/evidence/planning.md); minutes"
 	@echo "make contact-study  false alarms an hour and height of the thresholds of contact (docs/evidence/contact.md); minutes"
+	@echo "make mutation-study  small faults planted into the product, and whether a test notices (docs/evidence/tests.md); SEED=1 MUTANTS=300 MINUTES=55; resumable, hours"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
@@ -114,6 +115,9 @@ test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \
 		else echo "no npm: the foreign stack's tests are skipped"; fi
 	$(BIN)/python -m tests.vcan.run $(BIN)/python -m pytest -q -m vcan tests/vcan
+
+mutation-study: setup
+	$(BIN)/python -m tests.mutation.study $(if $(SEED),--seed $(SEED)) $(if $(MUTANTS),--mutants $(MUTANTS)) $(if $(MINUTES),--minutes $(MINUTES))
 
 chaos: setup vcan-tools
 	@mkdir -p out

@@ -111,6 +111,20 @@ def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_t
     assert exact.mass_reference_std_kg == 0.0
 
 
+def test_a_payload_of_exact_mass_hides_no_tolerance_of_another(
+    cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
+) -> None:
+    calibration = cells[0].calibration
+    (reference,) = calibration.payload_mass
+    exact = reference.weighed_to(0.0)
+    tolerant = reference.weighed_to(0.01 * reference.mass_kg)
+    alone = weigh_rows(replace(calibration, payload_mass=(tolerant,)), rows[0])
+    for both in ((exact, tolerant), (tolerant, exact)):
+        found = weigh_rows(replace(calibration, payload_mass=both), rows[0])
+        assert found.reference_covariance == pytest.approx(alone.reference_covariance)
+    assert alone.mass_reference_std_kg > 0.0
+
+
 def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
     count = len(calibration.gains)
     pairs = zip(calibration.gains, values[:count], strict=True)

@@ -21,12 +21,12 @@ import pytest
 from rich.console import Console
 
 from daq.cli.app import main
-from daq.cli.apply import entered_masses, tightened
+from daq.cli.apply import entered_masses, require_separate_audit, tightened
 from daq.config.cell_file import load_cell
 from daq.config.policy import ApplyPolicy
 from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
 from daq.environment import login
-from daq.errors import ExitCode, UsageError
+from daq.errors import AuditUnusable, ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
 from daq.report.proposal import change_table
@@ -763,3 +763,21 @@ def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) ->
         shown.append(done.stdout.decode("ascii"))
     assert "-9.210 \\u00b1 0.037" in shown[0]
     assert json.loads(shown[1])["file"] == str(file)
+
+
+def test_an_audit_is_compared_with_every_other_file_of_the_command(tmp_path: Path) -> None:
+    audit = tmp_path / "cell.audit.jsonl"
+    other = tmp_path / "controller.yaml"
+    require_separate_audit(audit, (None, other))
+    for others in ((None, audit), (other, None, audit)):
+        with pytest.raises(AuditUnusable, match="the same file as"):
+            require_separate_audit(audit, others)
+
+
+def test_an_audit_under_another_name_is_the_same_file(tmp_path: Path) -> None:
+    audit = tmp_path / "cell.audit.jsonl"
+    audit.touch()
+    link = tmp_path / "controller.yaml"
+    link.hardlink_to(audit)
+    with pytest.raises(AuditUnusable, match="the same file as"):
+        require_separate_audit(audit, (link,))

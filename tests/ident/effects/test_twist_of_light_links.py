@@ -1,0 +1,47 @@
+"""A link with little or no inertia behind a gear that is not rigid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.testing import assert_allclose
+
+from ident.arrays import FloatArray
+from ident.effects.twist import LEAST_SHARE, DrivenLink, Gears, twists
+
+RATE_HZ = 500.0
+SAMPLES = 600
+GEARS = Gears(np.zeros(1), np.array([1e-4]), 0.3)
+
+
+def _link(inertia_kg_m2: FloatArray) -> DrivenLink:
+    time_s = np.arange(SAMPLES) / RATE_HZ
+    speed = 0.5 + 0.2 * np.sin(2.0 * np.pi * 0.5 * time_s)
+    torque = 5.0 + np.sin(2.0 * np.pi * 0.5 * time_s)
+    return DrivenLink(RATE_HZ, inertia_kg_m2, torque, speed, np.zeros(SAMPLES))
+
+
+def test_a_link_without_inertia_does_not_lag() -> None:
+    link = _link(np.zeros(SAMPLES))
+    found = twists(link, GEARS)
+    assert not found.twist_rad.any()
+    assert_allclose(found.passed_nm[0], link.pushed_nm)
+
+
+def test_the_gear_of_a_link_in_motion_is_a_spring_under_its_torque() -> None:
+    found = twists(_link(np.full(SAMPLES, 0.2)), GEARS)
+    inside = slice(100, -100)
+    # δ = c τ, since the torque changes slowly beside the resonance.
+    expected = 1e-4 * _link(np.full(SAMPLES, 0.2)).pushed_nm
+    assert_allclose(found.twist_rad[0, inside], expected[inside], rtol=0.02)
+
+
+def test_an_inertia_that_is_none_counts_as_a_small_one_and_a_real_one_as_it_is() -> None:
+    inertia = np.full(SAMPLES, 0.2)
+    negative = inertia.copy()
+    negative[300] = -0.1
+    smallest = inertia.copy()
+    smallest[300] = LEAST_SHARE * float(np.mean(negative))
+    assert_allclose(twists(_link(negative), GEARS).passed_nm, twists(_link(smallest), GEARS).passed_nm, rtol=1e-6)
+    heavier = twists(_link(2.0 * inertia), GEARS).twist_rad
+    assert np.isfinite(heavier).all()
+    assert np.abs(heavier - twists(_link(inertia), GEARS).twist_rad).max() > 0.0

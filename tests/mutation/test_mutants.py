@@ -1,0 +1,119 @@
+"""Faults that the mutation study plants: what they are, where they stand, and which tests it runs."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.mutation.mutants import Mutant, compiles, mutants_of
+from tests.mutation.study import Outcome, chosen_mutants, mirrored, room_of, summary
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _planted(source: str) -> set[tuple[str, str]]:
+    """Kind and changed source of every mutant."""
+    data = source.encode()
+    return {(mutant.kind, mutant.planted(data).decode()) for mutant in mutants_of(data)}
+
+
+@pytest.mark.parametrize(
+    ("source", "kind", "changed"),
+    [
+        ("a < b\n", "comparison", "a <= b\n"),
+        ("a is not None\n", "comparison", "a is None\n"),
+        ("a not in b\n", "comparison", "a in b\n"),
+        ("x = a - b\n", "arithmetic", "x = a + b\n"),
+        ("x = a ** b\n", "arithmetic", "x = a * b\n"),
+        ("x = a or b\n", "connective", "x = a and b\n"),
+        ("x = not a\n", "not", "x = a\n"),
+        ("x = -a\n", "sign", "x = a\n"),
+        ("x = 3\n", "constant", "x = 4\n"),
+        ("x = 0.5\n", "constant", "x = 1.0\n"),
+        ("x = True\n", "constant", "x = False\n"),
+        ("x = a[1:n]\n", "slice", "x = a[:n]\n"),
+        ("x = np.minimum(a, b)\n", "function", "x = np.maximum(a, b)\n"),
+        ("x = f(a, b)\n", "arguments", "x = f(b, a)\n"),
+        ("if a:\n    f()\n", "condition", "if not (a):\n    f()\n"),
+        ("if a:\n    f()\n", "call", "if a:\n    pass\n"),
+        ("def f():\n    return a\n", "return", "def f():\n    return None\n"),
+        ("def f():\n    raise E\n", "raise", "def f():\n    pass\n"),
+        ("for a in b:\n    break\n", "loop", "for a in b:\n    continue\n"),
+        ("x = 'é' + f(a * b)\n", "arithmetic", "x = 'é' + f(a / b)\n"),
+    ],
+)
+def test_a_fault_of_each_kind_is_planted_at_its_place(source: str, kind: str, changed: str) -> None:
+    assert (kind, changed) in _planted(source)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""A docstring with 3 < 4."""\n',
+        "def f(a: dict[str, 3]) -> 4: ...\n",
+        "x = f'{a - b}'\n",
+        "__all__ = ['a', 'b']\n",
+        "if TYPE_CHECKING:\n    x = 3\n",
+        "@f(3)\nclass A: ...\n",
+        "x = math.isclose(a, b)\n",
+    ],
+)
+def test_what_is_no_behaviour_gets_no_fault(source: str) -> None:
+    assert _planted(source) == set()
+
+
+def test_every_fault_changes_the_program_of_a_real_file() -> None:
+    source = (ROOT / "ident" / "arrays.py").read_bytes()
+    original = ast.dump(ast.parse(source))
+    mutants = [mutant for mutant in mutants_of(source) if compiles(mutant.planted(source))]
+    assert len(mutants) > 50
+    for mutant in mutants:
+        assert ast.dump(ast.parse(mutant.planted(source))) != original, mutant
+        assert source[: mutant.start].count(b"\n") + 1 == mutant.line
+
+
+def test_a_draw_is_repeated_by_its_seed_and_takes_every_room() -> None:
+    first = chosen_mutants(ROOT, seed=5, count=60)
+    again = chosen_mutants(ROOT, seed=5, count=60)
+    other = chosen_mutants(ROOT, seed=6, count=60)
+    assert first == again
+    assert first != other
+    rooms = {room_of(planted.file) for planted in first}
+    assert {"ident/model", "daq/log", "drivers/stream", "ident"} <= rooms
+    assert len(set(first)) == 60
+
+
+@pytest.mark.parametrize(
+    ("test", "file", "expected"),
+    [
+        ("tests/ident/model/test_base.py::test_a", "ident/model/base.py", True),
+        ("tests/ident/data/test_run.py::test_a", "ident/model/base.py", False),
+        ("tests/ident/test_weighing.py::test_a[1/2]", "ident/weighing.py", True),
+        ("tests/ident/model/test_base.py::test_a", "ident/weighing.py", False),
+        ("tests/pipeline/test_main_job.py::test_a", "daq/jobs/session.py", False),
+    ],
+)
+def test_a_mirrored_test_stands_in_the_room_of_the_file(test: str, file: str, expected: bool) -> None:
+    assert mirrored(test, file) is expected
+
+
+def test_the_summary_counts_what_was_missed_by_room() -> None:
+    results = ["mirrored", "other", "survived", "not executed"]
+    outcomes = [
+        Outcome(number, "ident/model/base.py", 1, "sign", "-a", "a", result, "")
+        for number, result in enumerate(results)
+    ]
+    lines = list(summary(outcomes))
+    assert len(lines) == 2
+    assert lines[0].startswith("ident/model ")
+    assert lines[-1].startswith("all rooms ")
+    assert "4 mutants, noticed    2, by the mirrored tests    1, missed 2" in lines[-1]
+
+
+def test_a_planted_fault_can_be_taken_out_again() -> None:
+    source = b"x = a < b\n"
+    mutant = next(iter(mutants_of(source)))
+    assert mutant == Mutant("comparison", 1, 6, 7, "<", "<=")
+    assert mutant.planted(source) == b"x = a <= b\n"
