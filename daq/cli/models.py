@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +19,7 @@ from ident.plausible import format_at_limit
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+    from daq.workflow.urdf_shapes import UrdfShapes
     from ident.arrays import FloatArray
     from ident.calibration import Calibration
     from ident.model.model import Model
@@ -48,15 +49,7 @@ def export_urdf_verb(
     from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
     from daq.workflow.validate import on_cell
 
-    if (calibration is None) == (urdf is None):
-        raise UsageError(
-            "export urdf",
-            found="one file and no --urdf" if urdf is None else "a cell file and --urdf",
-            expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
-            remedy="give the cell file, then the calibration; or leave the cell file out",
-        )
-    given = urdf or cell
-    calibration = calibration or cell
+    given, calibration = _described_by("export urdf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
     _require_explained(known, calibration)
@@ -88,59 +81,156 @@ def export_urdf_verb(
 
 
 def export_mjcf_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits.")],
-    calibration: Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")],
+    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
     out: Annotated[Path, output_option("--out", "MJCF model to write (.xml).")],
+    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Write the calibrated robot as an MJCF model for MuJoCo 3.3.1 or later.
 
     Masses, inertias, rotors, friction, and a motor for each axis: its gear is the drive gain, its input the current
-    reference. Bodies are the full parameters of `fit --prior`; without them, the nearest physical bodies to the cell's
-    URDF (pip install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
+    reference. Names, frames, shapes and meshes are those of the URDF. Bodies are the full parameters of `fit --prior`;
+    without them, the nearest physical bodies to the URDF (pip install 'drivegain[physical]'). What the model cannot
+    hold is listed in it and under --json.
     """
     from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
     from daq.workflow.full_choice import full_choice
-    from daq.workflow.mjcf_effects import joint_effects, split_installed
+    from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
-    from daq.workflow.urdf_export import cell_limits, random_states
-    from daq.workflow.validate import on_cell
+    from daq.workflow.urdf_export import random_states
     from ident.model.urdf import read_urdf
 
-    check_output(out, (calibration, cell), FORMAT)
+    given, calibration = _described_by("export mjcf", cell, calibration, urdf)
+    check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
     _require_explained(known, calibration)
-    declared = _declared(known, cell)
-    same = _is_same(known, declared)
-    known, missing = split_installed(known)
-    known, model = on_cell(known, declared)
-    limits = cell_limits(declared)
+    described = _of_cell(known, given) if urdf is None else _of_urdf(known, given)
+    known = described.calibration
     if known.full_parameters is None:
         require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
     with status("choosing the bodies"):
-        choice = full_choice(known, model, limits, declared.urdf)
-    followed = choice.model.follow(random_states(choice.model, limits))
+        choice = full_choice(known, described.model, described.limits, described.urdf)
+    followed = choice.model.follow(random_states(choice.model, described.limits))
     effects = joint_effects(known, choice.model.robot)
-    effects = replace(effects, left_out=(*effects.left_out, *missing))
+    effects = replace(effects, left_out=(*effects.left_out, *described.missing))
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
         standard=choice.standard,
         gains=known.gains,
-        frames=read_urdf(declared.urdf).links,
-        lower=limits[0] - limits[1],
-        upper=limits[0] + limits[1],
+        frames=read_urdf(described.urdf).links,
+        lower=described.lower,
+        upper=described.upper,
+        shapes=described.shapes,
+        folder=out.parent,
         effects=effects,
-        remarks=tuple(head_remarks(known, choice, effects, software())),
+        remarks=tuple(head_remarks(known, choice, effects, described.shapes, software())),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):
         replace_file(out, written.content)
-    report = mjcf_report(known, choice, source, written, out, same)
+    report = mjcf_report(known, choice, source, written, out, described.same)
     if json:
         print_json(report)
     else:
         print_view(mjcf_view(report), out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Described:
+    """A robot that a model is written of."""
+
+    calibration: Calibration  #: without effects that are not installed, with the corrections that the cell still needs
+    missing: tuple[str, ...]  #: effects that are not installed
+    model: Model
+    limits: FloatArray  #: ranges in which torques are compared, shape (4, m)
+    lower: FloatArray  #: least position of each axis, -inf without a limit, shape (m,)
+    upper: FloatArray
+    urdf: str
+    shapes: UrdfShapes
+    same: bool | None  #: whether the description is that of the fit; None where nothing says so
+
+
+def _of_cell(calibration: Calibration, path: Path) -> _Described:
+    """The robot of a cell file."""
+    from daq.config.cell_file import urdf_path
+    from daq.workflow.mjcf_effects import split_installed
+    from daq.workflow.urdf_export import cell_limits
+    from daq.workflow.urdf_shapes import shapes_of
+    from daq.workflow.validate import on_cell
+
+    cell = _declared(calibration, path)
+    same = _is_same(calibration, cell)
+    installed, missing = split_installed(calibration)
+    known, model = on_cell(installed, cell)
+    limits = cell_limits(cell)
+    return _Described(
+        calibration=known,
+        missing=missing,
+        model=model,
+        limits=limits,
+        lower=limits[0] - limits[1],
+        upper=limits[0] + limits[1],
+        urdf=cell.urdf,
+        shapes=shapes_of(cell.urdf, urdf_path(path).parent),
+        same=same,
+    )
+
+
+def _of_urdf(calibration: Calibration, path: Path) -> _Described:
+    """The robot of a URDF alone, with a motor for each joint."""
+    import numpy as np
+
+    from daq.config.yaml_file import read_yaml_bytes
+    from daq.workflow.mjcf_effects import split_installed
+    from daq.workflow.urdf_export import parse_markup
+    from daq.workflow.urdf_shapes import joint_ranges, shapes_of
+
+    content = read_yaml_bytes(path)
+    parse_markup(content, str(path))  # before any other reader sees it
+    urdf = content.decode("utf-8")
+    model, limits = _plain(urdf)
+    joints = [joint.name for joint in model.robot.joints]
+    if len(joints) != len(calibration.gains):
+        raise ConfigurationInconsistent(
+            str(path),
+            found=f"{len(joints)} moving joints: {', '.join(joints)}",
+            expected=f"{len(calibration.gains)}, one for each axis of the calibration",
+            remedy="give the URDF of the robot that was calibrated, or its cell file, which says what moves its joints",
+        )
+    installed, missing = split_installed(calibration)
+    ranges = joint_ranges(urdf)
+    bounds = np.array([ranges[name] for name in joints])
+    return _Described(
+        calibration=installed,
+        missing=missing,
+        model=model,
+        limits=limits,
+        lower=bounds[:, 0],
+        upper=bounds[:, 1],
+        urdf=urdf,
+        shapes=shapes_of(urdf, path.parent),
+        same=None,
+    )
+
+
+def _described_by(verb: str, cell: Path, calibration: Path | None, urdf: Path | None) -> tuple[Path, Path]:
+    """Return the file that describes the robot, and the calibration: of CELL CALIBRATION or CALIBRATION --urdf FILE."""
+    if (calibration is None) == (urdf is None):
+        raise UsageError(
+            verb,
+            found="one file and no --urdf" if urdf is None else "a cell file and --urdf",
+            expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
+            remedy="give the cell file, then the calibration; or leave the cell file out",
+        )
+    if urdf is not None:
+        return urdf, cell
+    assert calibration is not None  # or urdf would be given
+    return cell, calibration
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:

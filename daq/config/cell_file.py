@@ -205,6 +205,15 @@ def _without(tree: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     return {key: value for key, value in tree.items() if key not in keys}
 
 
+def urdf_path(path: Path) -> Path:
+    """Return the URDF that a cell file names.
+
+    Raises:
+        ConfigurationError: the cell file is missing, or is not what its schema says.
+    """
+    return _sources(path)[URDF]
+
+
 def _sources(path: Path) -> dict[str, Path]:
     """Locate the members of a cell's bundle on disk."""
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), CellModel)

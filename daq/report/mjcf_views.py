@@ -15,6 +15,7 @@ from daq.report.text import origin_text, plain_table, printable, terminal_text
 from daq.workflow.full_choice import FullChoice
 from daq.workflow.mjcf_effects import JointEffects
 from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
+from daq.workflow.urdf_shapes import UrdfShapes
 from ident.calibration import Calibration
 from ident.model.bodies import LOADED, body_of
 from ident.physical.drive_terms import drive_terms
@@ -100,15 +101,22 @@ class MjcfReport(Report):
     """payloads that the calibration knows; the model is of the robot without one"""
     closures_left_out: list[str]
     """loops that no constraint of MuJoCo closes"""
+    meshes: list[str]
+    """files of meshes that the model names; they stay where they are"""
+    shapes_left_out: list[str]
+    """shapes of the URDF's links that the model lacks, each with its reason"""
 
 
-def head_remarks(calibration: Calibration, choice: FullChoice, effects: JointEffects, software: str) -> Iterator[str]:
+def head_remarks(
+    calibration: Calibration, choice: FullChoice, effects: JointEffects, shapes: UrdfShapes, software: str
+) -> Iterator[str]:
     """Lines for the head of the model.
 
     Args:
         calibration: that is exported.
         choice: its full parameters.
         effects: of it.
+        shapes: of the robot's URDF.
         software: name and version.
     """
     yield f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 or later."
@@ -121,6 +129,8 @@ def head_remarks(calibration: Calibration, choice: FullChoice, effects: JointEff
     mountings = _mountings(calibration)
     if mountings:
         yield f"Payloads NOT in this model: {', '.join(mountings)}"
+    if shapes.left_out:
+        yield f"Shapes NOT in this model: {'; '.join(shapes.left_out)}"
 
 
 def mjcf_report(
@@ -157,6 +167,8 @@ def mjcf_report(
         corrections_applied=source.effects.in_geometry,
         mountings_left_out=_mountings(calibration),
         closures_left_out=written.open_closures,
+        meshes=sorted({str(shape.mesh) for shape in source.shapes.found if shape.mesh is not None}),
+        shapes_left_out=source.shapes.left_out,
     )
 
 
@@ -197,6 +209,8 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     left_out += [f"closure {name}" for name in report.closures_left_out]
     if left_out:
         yield printable(f"Not in the model: {', '.join(left_out)}.")
+    if report.shapes_left_out:
+        yield printable(f"Shapes that are not in the model: {'; '.join(report.shapes_left_out)}.")
     if report.same_configuration is False:
         yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
 

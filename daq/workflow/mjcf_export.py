@@ -8,6 +8,7 @@
 | drive gain | `gear` of a `<motor>` on the joint or tendon: its `ctrl` is the current reference |
 | springs, friction of joints without a motor | at their joint (`daq.workflow.mjcf_effects`) |
 | closure of a loop | `<connect>` or `<weld>` between two sites |
+| `<visual>`, `<collision>` of the URDF | `<geom>` of class `visual`, `collision`; meshes stay where they are |
 
 MuJoCo makes dry friction a soft constraint. `solreffriction` and `solimpfriction` are as stiff as a step allows: a
 joint that friction can stop within a step stops, and one that moves on has its whole dry friction. Loops are closed by
@@ -16,15 +17,18 @@ soft constraints, too.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from daq.workflow.mjcf_effects import JointEffects
+from daq.workflow.urdf_shapes import ShapeKind, UrdfShape, UrdfShapes
 from ident.arrays import FloatArray
 from ident.calibration import Gain
 from ident.model.bodies import body_of
@@ -40,6 +44,8 @@ CLOSED_SHARE = 1e-6
 HINGE_SHARE = 0.1  #: Distance of the two points that hold a hinge of a loop, as a share of the robot's size
 WORLD = "world"  #: Name of MuJoCo's own body, which no other one may have
 THINNEST_M = 1e-3  #: Shorter links are not drawn
+VISUAL = "visual"  #: Class of the shapes that are drawn
+COLLISION = "collision"  #: Class of those that links touch each other with
 _LENGTHS = frozenset({"x", "y", "z"})
 _TURNS = {"rx": 0, "ry": 1, "rz": 2}
 
@@ -54,8 +60,10 @@ class MjcfSource:
     gains: tuple[Gain, ...]  #: one an axis
     #: Frames of the URDF's links by name: the joint that moves each of them, and where it is in that joint's frame.
     frames: Mapping[str, Place]
-    lower: FloatArray  #: least position of each axis [rad or m], shape (m,)
+    lower: FloatArray  #: least position of each axis [rad or m], -inf without a limit, shape (m,)
     upper: FloatArray  #: largest position, shape (m,)
+    shapes: UrdfShapes  #: of the URDF's links
+    folder: Path  #: that the model will be in; names of mesh files are relative to it
     effects: JointEffects  #: of the calibration
     remarks: tuple[str, ...]  #: for the comment at the head, beside what the writer itself leaves out
 
@@ -86,7 +94,9 @@ def write_mjcf(source: MjcfSource, closed_positions: FloatArray) -> Mjcf:
     gravity = _numbers(robot.gravity_m_s2)
     SubElement(root, "option", timestep=repr(TIME_STEP_S), gravity=gravity, integrator="implicitfast")
     _add_defaults(root)
+    meshes = _add_meshes(root, source)
     bodies = _add_bodies(root, source, terms)
+    _add_shapes(source, bodies, meshes)
     _add_frames(source, bodies)
     open_closures = tuple(_add_closures(root, source, bodies, closed_positions))
     _add_tendons(root, source, terms)
@@ -112,6 +122,56 @@ def _add_defaults(root: Element) -> None:
     SubElement(default, "equality", solref=_numbers((4.0 * TIME_STEP_S, 1.0)))
     # What is drawn has neither mass nor contact.
     SubElement(default, "geom", type="capsule", size="0.02", contype="0", conaffinity="0", mass="0", group="2")
+    visual = SubElement(default, "default", {"class": VISUAL})
+    SubElement(visual, "geom", group="2")
+    # Contact changes torques: who wants it gives this class contype="1" conaffinity="1".
+    collision = SubElement(default, "default", {"class": COLLISION})
+    SubElement(collision, "geom", group="3")
+
+
+def _add_meshes(root: Element, source: MjcfSource) -> dict[tuple[Path, tuple[float, ...]], str]:
+    """Add each mesh once for each scale, and return their names."""
+    names: dict[tuple[Path, tuple[float, ...]], str] = {}
+    for shape in source.shapes.found:
+        if shape.mesh is not None:
+            names.setdefault((shape.mesh, shape.size), f"mesh {len(names) + 1}")
+    if not names:
+        return names
+    asset = SubElement(root, "asset")
+    folder = source.folder.resolve()
+    for (file, scale), name in names.items():
+        # A shell, because a mesh that is not closed has no volume; its inertia is not used.
+        relative = Path(os.path.relpath(file, folder)).as_posix()
+        SubElement(asset, "mesh", name=name, file=relative, scale=_numbers(scale), inertia="shell")
+    return names
+
+
+def _add_shapes(
+    source: MjcfSource, bodies: Sequence[Element], meshes: Mapping[tuple[Path, tuple[float, ...]], str]
+) -> None:
+    """Add what the URDF shows of its links, and the shapes that they touch others with."""
+    for shape in source.shapes.found:
+        place = source.frames[shape.link]
+        use = COLLISION if shape.is_collision else VISUAL
+        geom = SubElement(bodies[place.joint + 1], "geom", {"class": use, "type": shape.kind.value})
+        if shape.mesh is None:
+            geom.set("size", _numbers(_half_sizes(shape)))
+        else:
+            geom.set("mesh", meshes[shape.mesh, shape.size])
+        geom.set("pos", _numbers(place.translation_m + place.rotation @ shape.translation_m))
+        geom.set("quat", _quaternion(place.rotation @ shape.rotation))
+        if shape.colour is not None:
+            geom.set("rgba", _numbers(shape.colour))
+
+
+def _half_sizes(shape: UrdfShape) -> tuple[float, ...]:
+    """Sizes as MuJoCo has them: half the sides of a box and half the length of a cylinder."""
+    if shape.kind is ShapeKind.BOX:
+        return tuple(0.5 * side_m for side_m in shape.size)
+    if shape.kind is ShapeKind.SPHERE:
+        return shape.size
+    radius_m, length_m = shape.size
+    return radius_m, 0.5 * length_m
 
 
 def _add_bodies(root: Element, source: MjcfSource, terms: DriveTerms) -> list[Element]:
@@ -120,10 +180,12 @@ def _add_bodies(root: Element, source: MjcfSource, terms: DriveTerms) -> list[El
     robot = model.robot
     links = source.standard[model.link_columns]
     names = _body_names(source)
+    # Where the URDF shows nothing, capsules from joint to joint say where the robot is.
+    is_drawn = any(not shape.is_collision for shape in source.shapes.found)
     bodies = [SubElement(root, "worldbody")]
     for index, joint in enumerate(robot.joints):
         parent = bodies[joint.parent + 1]
-        if np.linalg.norm(joint.translation_m) > THINNEST_M:
+        if not is_drawn and np.linalg.norm(joint.translation_m) > THINNEST_M:
             SubElement(parent, "geom", fromto=_numbers((0.0, 0.0, 0.0, *joint.translation_m)))
         body = SubElement(
             parent,
@@ -158,7 +220,9 @@ def _add_joint(body: Element, source: MjcfSource, terms: DriveTerms, index: int)
         element.set(attribute, _number(value))
     if index in robot.axis_joints:
         axis = robot.axis_joints.index(index)
-        element.set("range", _numbers((source.lower[axis], source.upper[axis])))
+        limits = (source.lower[axis], source.upper[axis])
+        if np.isfinite(limits).all():
+            element.set("range", _numbers(limits))
 
 
 def joint_drive(source: MjcfSource, terms: DriveTerms, index: int) -> dict[str, float]:
@@ -199,10 +263,10 @@ def _is_joint_frame(place: Place) -> bool:
 
 
 def _add_frames(source: MjcfSource, bodies: Sequence[Element]) -> None:
-    """Add a site for each link that is fixed to a moving one."""
+    """Add a site for each link that is fixed to a moving one, or to the base."""
     own = set(_body_names(source))
     for name, place in source.frames.items():
-        if place.joint >= 0 and name not in own:
+        if name not in own:
             _add_site(bodies, name, place)
 
 

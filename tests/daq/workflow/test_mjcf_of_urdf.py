@@ -1,0 +1,311 @@
+"""`export mjcf` keeps what a URDF shows: names, frames, shapes and meshes; with `--urdf` it needs no cell file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from daq.cli.app import main
+from ident.model.robot import poses
+from tests.conftest import CHECKOUT
+from tests.daq.robot_calibrations import CalibratedRobot, apart, calibrated_robot, robot_of
+from tests.daq.workflow.test_export_mjcf import SAME, is_moving
+
+pytestmark = pytest.mark.slow
+
+FloatArray = NDArray[np.float64]
+CORNERS = ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.1))
+FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+SQUARE = ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.1, 0.1, 0.0), (0.0, 0.1, 0.0))
+SQUARE_FACES = ((0, 1, 2), (0, 2, 3))
+VISUAL_GROUP = 2
+COLLISION_GROUP = 3
+
+
+def stl_of(faces: Sequence[Sequence[int]], points: Sequence[Sequence[float]] = CORNERS) -> bytes:
+    """A binary STL of triangles between points."""
+    body = bytearray(b" " * 80 + struct.pack("<I", len(faces)))
+    for face in faces:
+        corners = np.array(points)[list(face)].ravel()
+        body += struct.pack("<12fH", 0.0, 0.0, 0.0, *corners, 0)
+    return bytes(body)
+
+
+def with_shapes(robot: str, shapes: dict[str, str], head: str = "") -> str:
+    """The URDF of a shipped robot with shapes in some links."""
+    urdf = (CHECKOUT / f"configs/robots/{robot}.urdf").read_text()
+    for link, text in shapes.items():
+        tag = f'<link name="{link}">'
+        assert urdf.count(tag) == 1
+        urdf = urdf.replace(tag, tag + text)
+    return urdf.replace("<link", head + "<link", 1)
+
+
+def loaded(path: Path) -> Any:
+    """Load a model from its file; MuJoCo warns of what it changes in it."""
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert warnings == []
+    return model
+
+
+def inverse_nm(simulated: Any, robot: CalibratedRobot) -> FloatArray:
+    """Torque of each axis of a serial robot by MuJoCo's inverse dynamics, shape (m, k)."""
+    data = mujoco.MjData(simulated)
+    torques = []
+    states = robot.states
+    for position, velocity, acceleration in zip(
+        states.position_rad, states.velocity_rad_s, states.acceleration_rad_s2, strict=True
+    ):
+        data.qpos[:] = position
+        data.qvel[:] = velocity
+        data.qacc[:] = acceleration
+        mujoco.mj_inverse(simulated, data)
+        torques.append(data.qfrc_inverse.copy())
+    return np.array(torques).T
+
+
+def missing_nm(report: dict[str, Any], robot: CalibratedRobot) -> FloatArray:
+    """Torque that the document says the model lacks, shape (m, k)."""
+    value_of = {entry["name"]: entry["value"] for entry in report["not_in_mjcf"]}
+    values = np.array([value_of.get(column.name, 0.0) for column in robot.model.columns])
+    return np.asarray(np.einsum("jck,c->jk", robot.model.regressor(robot.states), values))
+
+
+def export(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    """Run the command."""
+    assert main(["export", "mjcf", *map(str, arguments), "--json"]) == 0
+    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return report
+
+
+SHAPES = {
+    "link1": '<visual><geometry><box size="0.2 0.4 0.6"/></geometry><material name="grey"/></visual>',
+    "link2": '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/>'
+    '<geometry><mesh filename="package://arm_description/meshes/link 2.stl" scale="2 2 -2"/></geometry></visual>',
+    "link3": '<visual><geometry><mesh filename="../meshes/flat.STL"/></geometry></visual>'
+    '<collision><geometry><cylinder radius="0.05" length="0.4"/></geometry></collision>',
+    "link5": '<visual><geometry><sphere radius="0.07"/></geometry>'
+    '<material name="own"><color rgba="1 0 0 0.5"/></material></visual>',
+}
+
+
+@pytest.fixture
+def urdf_of_arm(tmp_path: Path) -> Path:
+    """The TX-40 in a package of ROS, with meshes."""
+    package = tmp_path / "arm_description"
+    (package / "urdf").mkdir(parents=True)
+    (package / "meshes").mkdir()
+    (package / "meshes/link 2.stl").write_bytes(stl_of(FACES))
+    (package / "meshes/flat.STL").write_bytes(stl_of(SQUARE_FACES, SQUARE))
+    path = package / "urdf/tx40.urdf"
+    head = '<material name="grey"><color rgba="0.25 0.5 0.75 1"/></material>'
+    tool = (
+        '<link name="tool"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>'
+        '<joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 -0.2 1.1"/>'
+        '<parent link="link6"/><child link="tool"/></joint></robot>'
+    )
+    path.write_text(with_shapes("tx40", SHAPES, head).replace("</robot>", tool))
+    return path
+
+
+def test_a_urdf_alone_gives_the_predicted_torque_with_its_shapes(
+    tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Shapes touch nothing: torques are those of the model without them."""
+    robot = uncoupled_arm(tmp_path)
+    out = tmp_path / "models/robot.xml"
+    out.parent.mkdir()
+    report = export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    assert report["same_configuration"] is None
+    assert report["shapes_left_out"] == []
+    assert [Path(mesh).name for mesh in report["meshes"]] == ["flat.STL", "link 2.stl"]
+    simulated = loaded(out)
+    # Stops of the URDF, which are narrower than those of the cell, push back.
+    position_rad = robot.states.position_rad
+    lower_rad, upper_rad = simulated.jnt_range.T
+    is_free = ((position_rad > lower_rad) & (position_rad < upper_rad)).all(axis=1)
+    moving = is_moving(robot) & is_free
+    assert moving.sum() >= 50
+    found = inverse_nm(simulated, robot) + missing_nm(report, robot)
+    assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
+    joints = [joint.name for joint in robot.model.robot.joints]
+    assert [simulated.joint(number).name for number in range(simulated.njnt)] == joints
+    assert {simulated.body(number).name for number in range(1, simulated.nbody)} == {f"link{i}" for i in range(1, 7)}
+
+
+def uncoupled_arm(folder: Path) -> CalibratedRobot:
+    """The TX-40 with a motor for each joint."""
+    coupled = "- [0, 0, 0, 0, 32, 32]"
+    text = (CHECKOUT / "configs/cells/tx40.yaml").read_text()
+    assert text.count(coupled) == 1
+    (folder / "cells").mkdir()
+    (folder / "robots").mkdir()
+    (folder / "robots/tx40.urdf").write_bytes((CHECKOUT / "configs/robots/tx40.urdf").read_bytes())
+    cell = folder / "cells/tx40.yaml"
+    cell.write_text(text.replace(coupled, "- [0, 0, 0, 0, 0, 32]"))
+    return calibrated_robot(cell)
+
+
+def test_shapes_are_where_the_urdf_has_them(
+    tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = uncoupled_arm(tmp_path)
+    out = tmp_path / "robot.xml"
+    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    simulated = loaded(out)
+    data = mujoco.MjData(simulated)
+    data.qpos[:] = robot.states.position_rad[3]
+    mujoco.mj_kinematics(simulated, data)
+    placed = poses(robot.model.robot, robot.states.position_rad[3:4])
+    geoms = {(simulated.body(geom.bodyid[0]).name, geom.group[0]): geom for geom in geoms_of(simulated)}
+    assert set(geoms) == {
+        ("link1", VISUAL_GROUP),
+        ("link2", VISUAL_GROUP),
+        ("link3", VISUAL_GROUP),
+        ("link3", COLLISION_GROUP),
+        ("link5", VISUAL_GROUP),
+        ("link6", VISUAL_GROUP),
+    }
+    assert not simulated.geom_contype.any()
+    assert not simulated.geom_conaffinity.any()
+    assert geoms["link1", VISUAL_GROUP].size == pytest.approx((0.1, 0.2, 0.3))
+    assert geoms["link1", VISUAL_GROUP].rgba == pytest.approx((0.25, 0.5, 0.75, 1.0))
+    assert geoms["link3", COLLISION_GROUP].size[:2] == pytest.approx((0.05, 0.2))
+    assert geoms["link5", VISUAL_GROUP].rgba == pytest.approx((1.0, 0.0, 0.0, 0.5))
+    # Corners of the mesh in the world: by the model, and by the URDF.
+    geom = geoms["link2", VISUAL_GROUP]
+    first = simulated.mesh_vertadr[geom.dataid[0]]
+    vertices = simulated.mesh_vert[first : first + simulated.mesh_vertnum[geom.dataid[0]]]
+    shown = data.geom_xpos[geom.id] + vertices @ data.geom_xmat[geom.id].reshape(3, 3).T
+    corners = np.array(CORNERS) * (2.0, 2.0, -2.0)
+    in_link = Rotation.from_euler("xyz", (0.4, -0.5, 0.6)).apply(corners) + np.array((0.1, 0.2, 0.3))
+    expected = placed.origin_m[2, 0] + in_link @ placed.rotation[2, 0].T
+    for corner in expected:
+        assert np.linalg.norm(shown - corner, axis=1).min() < 1e-6
+    # What is behind a fixed joint is in the frame of its own link.
+    tool = geoms["link6", VISUAL_GROUP]
+    at_tool = placed.origin_m[6, 0] + placed.rotation[6, 0] @ (0.1, 0.02, 0.3)
+    assert data.geom_xpos[tool.id] == pytest.approx(at_tool, abs=1e-12)
+    turned = placed.rotation[6, 0] @ Rotation.from_euler("xyz", (0.4, -0.2, 1.1)).as_matrix()
+    assert data.geom_xmat[tool.id].reshape(3, 3) == pytest.approx(turned, abs=1e-12)
+
+
+def geoms_of(simulated: Any) -> list[Any]:
+    """Shapes of a model."""
+    return [simulated.geom(number) for number in range(simulated.ngeom)]
+
+
+def test_limits_are_those_of_the_urdf(tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A joint without limits has none in the model."""
+    robot = uncoupled_arm(tmp_path)
+    urdf = urdf_of_arm.read_text()
+    first = urdf.index("<limit")
+    limit = urdf[first : urdf.index("/>", first) + 2]
+    changed = urdf.replace(limit, '<limit lower="-1.25" upper="0.5" effort="9" velocity="9"/>', 1)
+    last = changed.rindex("<joint", 0, changed.rindex("<limit"))
+    head = changed[last : changed.index(">", last)]
+    changed = changed.replace(head, head.replace("revolute", "continuous"))
+    urdf_of_arm.write_text(changed)
+    out = tmp_path / "robot.xml"
+    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    simulated = loaded(out)
+    assert simulated.joint(0).range == pytest.approx((-1.25, 0.5))
+    assert simulated.jnt_limited.tolist() == [1, 1, 1, 1, 1, 0]
+
+
+def test_the_shapes_of_a_cell_are_those_of_its_urdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A coupled wrist needs its cell file, and meshes are found from the folder of the URDF."""
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots/arm.stl").write_bytes(stl_of(FACES))
+    mesh = '<visual><geometry><mesh filename="arm.stl"/></geometry></visual>'
+    (tmp_path / "robots/kr270.urdf").write_text(with_shapes("kr270", {"link3": mesh}))
+    cell = tmp_path / "cells/kr270.yaml"
+    cell.write_text((CHECKOUT / "configs/cells/kr270.yaml").read_text())
+    robot = calibrated_robot(cell)
+    out = tmp_path / "robot.xml"
+    report = export(capsys, cell, robot.saved(tmp_path), "--out", out)
+    simulated = loaded(out)
+    assert [simulated.body(geom.bodyid[0]).name for geom in geoms_of(simulated)] == ["link3"]
+    moving = is_moving(robot)
+    found = inverse_nm(simulated, robot) + missing_nm(report, robot)
+    assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
+
+
+def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
+    tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = uncoupled_arm(tmp_path)
+    meshes = urdf_of_arm.parent.parent / "meshes"
+    (meshes / "text.stl").write_text("solid arm\nendsolid arm\n")
+    (meshes / "cut.stl").write_bytes(stl_of(FACES)[:-7])
+    (meshes / "none.stl").write_bytes(stl_of(()))
+    (meshes / "arm.dae").write_text("<COLLADA/>")
+    wrong = {
+        '<mesh filename="../meshes/text.stl"/>': "no binary STL",
+        '<mesh filename="../meshes/cut.stl"/>': "was cut",
+        '<mesh filename="../meshes/none.stl"/>': "0 triangles",
+        '<mesh filename="../meshes/arm.dae"/>': "arm.dae is no .stl",
+        '<mesh filename="package://elsewhere/arm.stl"/>': "no file 'package://elsewhere/arm.stl'",
+        '<mesh filename="../meshes/link 2.stl" scale="1 0 1"/>': "scale '1 0 1'",
+        '<box size="1 2"/>': "size='1 2'",
+        '<sphere radius="nan"/>': "radius='nan'",
+        '<cylinder radius="0.1" length="-1"/>': "not positive",
+        "<cone/>": "<cone>",
+    }
+    visuals = "".join(f"<visual><geometry>{text}</geometry></visual>" for text in wrong)
+    urdf = urdf_of_arm.read_text().replace('<link name="link4">', f'<link name="link4">{visuals}<visual/>')
+    urdf_of_arm.write_text(urdf)
+    out = tmp_path / "robot.xml"
+    file = robot.saved(tmp_path)
+    report = export(capsys, file, "--urdf", urdf_of_arm, "--out", out)
+    assert len(report["shapes_left_out"]) == len(wrong) + 1
+    for reason, expected in zip(report["shapes_left_out"], [*wrong.values(), "0 geometries"], strict=True):
+        assert reason.startswith("visual of link4: ")
+        assert expected in reason
+    assert loaded(out).ngeom == 6
+    assert "Shapes NOT in this model: visual of link4: " in out.read_text()
+    assert main(["export", "mjcf", str(file), "--urdf", str(urdf_of_arm), "--out", str(out)]) == 0
+    assert "Shapes that are not in the model: visual of link4: " in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_urdf_of_another_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = robot_of("kr270")
+    file = robot.saved(tmp_path)
+    out = tmp_path / "robot.xml"
+    robots = CHECKOUT / "configs/robots"
+    command = ["export", "mjcf", str(file), "--out", str(out), "--urdf"]
+    assert main([*command, str(robots / "seven-axis.urdf")]) == 6
+    assert "7 moving joints: J1" in capsys.readouterr().err
+    assert main([*command, str(robots / "kr270.urdf")]) == 4  # its wrist is coupled
+    bomb = tmp_path / "bomb.urdf"
+    bomb.write_text('<!DOCTYPE robot [<!ENTITY a "b">]><robot name="r"/>')
+    assert main([*command, str(bomb)]) == 6
+    assert main(["export", "mjcf", str(robot.cell_file), *command[2:], str(robots / "kr270.urdf")]) == 2
+    assert main(["export", "mjcf", str(file), "--out", str(out)]) == 2
+    assert not out.exists()
+
+
+def test_a_frame_on_the_base_is_a_site_of_the_world(
+    tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = uncoupled_arm(tmp_path)
+    out = tmp_path / "robot.xml"
+    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    simulated = loaded(out)
+    assert simulated.site("base").bodyid[0] == 0
+    assert simulated.body(simulated.site("tool").bodyid[0]).name == "link6"
