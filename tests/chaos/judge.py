@@ -1,8 +1,9 @@
 """The judgement of a round, by what a listener, the files and the exit codes show: nothing of the product is imported.
 
-Eight things must hold whatever the faults were: (a) no value is in the log that was not on the bus, (b) every loss is
-counted, (c) the axes stop within their bound, (d) settings are restored, and the bus can be used again, (e) the exit
-code is that of the fault, without a traceback, (f) nothing moves without permission, (g) the controller's file is
+The listener must have heard the bus: one that heard nothing shows no violation. Eight things must hold whatever the
+faults were: (a) no value is in the log that was not on the bus, (b) every loss is counted, (c) the axes stop within
+their bound, (d) settings are restored, and the bus can be used again, (e) the exit code is one that the faults, or a
+stall on the bus, explain, without a traceback, (f) nothing moves without permission, (g) the controller's file is
 whole: all gains are those of one write, and nothing else has changed, (h) the chain of the audit log is unbroken, and
 what was removed from it is reported.
 
@@ -128,8 +129,64 @@ CODES = {
     Act.NO_PERMISSION: {int(ExitCode.USAGE)},
     Act.TERMINAL_CLOSED: {int(ExitCode.UNEXPECTED), int(ExitCode.INTERRUPTED), -signal.SIGHUP},
 }
-"""Exit codes that each act allows besides ANY_CODES."""
-ANY_CODES = {int(ExitCode.OK), int(ExitCode.DATA_UNFIT), int(ExitCode.DEVICE_FAULT)}
+"""Exit codes that each act allows besides those of SPOILS and STOPS_RUN."""
+SPOILS = {
+    Act.RECORDER_PAUSE,
+    Act.RECORDER_HANG,
+    Act.CAPTURE_KILL,
+    Act.CAPTURE_PAUSE,
+    Act.CAPTURE_HANG,
+    Act.CAPTURE_INT,
+    Act.CELL_KILL,
+    Act.CELL_PAUSE,
+    Act.CELL_HANG,
+    Act.CELL_INT,
+    Act.FLOOD,
+    Act.SYNC,
+    Act.NMT,
+    Act.TWIN,
+    Act.TWIN_SHORT,
+    Act.ERROR_PASSIVE,
+    Act.BUS_OFF,
+    Act.LINK_DOWN,
+    Inside.SILENT,
+    Inside.FROZEN,
+    Inside.STALE,
+    Inside.LIMIT,
+    Inside.LOST,
+    Inside.LATE,
+    Inside.DUPLICATE,
+    Inside.SHORT_PDO,
+    Inside.WRONG_COB_ID,
+    Inside.SHIFTED,
+    Inside.SECOND_MASTER,
+}
+"""Faults that damage or delay samples, so that a recording may end as unfit."""
+OWN_ENDS = {
+    Act.RECORDER_KILL,
+    Act.RECORDER_INT,
+    Act.RECORDER_INT_TWICE,
+    Act.RECORDER_TERM,
+    Act.TERMINAL_CLOSED,
+    Act.DISK_FULL,
+}
+"""Faults that stop the axes with exit codes of their own."""
+STOPS_RUN = (set(STOPS) - OWN_ENDS) | {
+    Act.RECORDER_PAUSE,
+    Act.CAPTURE_PAUSE,
+    Act.CAPTURE_INT,
+    Act.FLOOD,
+    Act.TWIN,
+    Act.TWIN_SHORT,
+    Act.TWIN_SDO,
+    Act.SDO_MASTER,
+    Act.SDO_ABORT,
+    Inside.SDO_MASTER,
+}
+"""Faults of a device or of the bus, after which a recording may end as a device fault."""
+LATE_CYCLES, SILENT_CYCLES = 1.5, 3
+"""Cycles without a SYNC on the bus, or without an answer of an axis, that explain unfit data and a device fault: a busy
+host stalls recorder and cell. The listener shows it, not the recorder's words."""
 UNSTOPPED_CODES = {int(ExitCode.OK), int(ExitCode.DATA_UNFIT)}
 """Exit codes of a recording that came to its end: wrong after a fault that must stop it."""
 UNREAD = {Act.SCREEN_CLOSED, Act.TERMINAL_CLOSED}
@@ -164,6 +221,7 @@ GONE = {Act.CELL_KILL, Act.CELL_INT, Act.LINK_DOWN}
 GAIN = re.compile(r"^(\s*gain:\s*)(\S+)", re.MULTILINE)
 """The gain of a drive in the controller's file, and what is before it on the line."""
 DIGEST = re.compile(r',"sha256":"([0-9a-f]{64})"')
+CHAIN_KEYS = ("previous", "sha256")
 FIRST = "0" * 64  #: Digest before the first entry of an audit log
 ENABLED, POWERED = 0x27, (0x27, 0x07, 0x23)  #: Statuswords under the mask 6Fh: OPERATION ENABLED, all with power
 STATUSWORD_MASK = 0x6F
@@ -268,6 +326,7 @@ def judge(
         same_sync_ns: see `tests.vcan.judgement.compare`; its stamps are those of the bus.
         in_order: see there.
     """
+    judge_listener(outcome)
     judge_log(outcome, log, same_sync_ns, in_order=in_order)
     judge_stop(outcome)
     judge_end(outcome)
@@ -276,6 +335,68 @@ def judge(
     judge_controller(outcome, before, gains)
     judge_audit(outcome)
     judge_writes(outcome)
+
+
+def judge_listener(outcome: Round) -> None:
+    """Add a listener that cannot have heard the bus: what it would show seems to hold then, (c) and (f) above all."""
+    if not outcome.frames:
+        outcome.violations.append("(listener) the listener heard nothing")
+    elif outcome.moved_ns and not any(is_setpoint(one.identifier, one.data) for one in outcome.frames):
+        outcome.violations.append("(listener) the listener heard nothing of the set-points, and the axes got some")
+    elif outcome.moved_ns and not any(is_answer(one) for one in outcome.frames):
+        outcome.violations.append("(listener) the listener heard nothing of the axes, and they got set-points")
+
+
+def is_setpoint(identifier: int, data: bytes) -> bool:
+    """Whether a frame is a new set-point for an axis."""
+    return identifier & ~0x7F == RPDO1 and len(data) > TARGET_BYTES and data[TARGET_BYTES] & NEW_SETPOINT != 0
+
+
+def is_answer(frame: Frame) -> bool:
+    """Whether a frame is the whole answer of an axis to a SYNC."""
+    is_of_axis = frame.identifier & ~0x7F == TPDO1 and frame.identifier & 0x7F in NODES
+    return is_of_axis and len(frame.data) == FEEDBACK.size
+
+
+def allowed_codes(outcome: Round) -> set[int]:
+    """Exit codes that the faults of a round, or a stall that the listener heard, can explain."""
+    kinds = outcome.kinds
+    allowed = {int(ExitCode.OK)}
+    stalled_cycles = longest_stall_cycles(outcome)
+    if kinds & SPOILS or stalled_cycles > LATE_CYCLES:
+        allowed.add(int(ExitCode.DATA_UNFIT))
+    if kinds & STOPS_RUN or stalled_cycles > SILENT_CYCLES:
+        allowed.add(int(ExitCode.DEVICE_FAULT))
+    for kind in kinds:
+        if isinstance(kind, Act):
+            allowed |= CODES.get(kind, set())
+    return allowed
+
+
+def longest_stall_cycles(outcome: Round) -> float:
+    """Longest time without a SYNC, or without an answer of an axis, from the first set-point to the end of power.
+
+    Returns:
+        The time in cycles; 0 without motion.
+    """
+    powered_ns = [
+        one.time_ns
+        for one in outcome.frames
+        if is_answer(one) and FEEDBACK.unpack(one.data)[2] & STATUSWORD_MASK == ENABLED
+    ]
+    until_ns = max(powered_ns, default=0)
+    if not 0 < outcome.moved_ns < until_ns:
+        return 0.0
+    last_ns: dict[int, int] = {}
+    longest_ns = 0
+    for one in outcome.frames:
+        is_regular = one.identifier == SYNC or is_answer(one)
+        if not is_regular or not outcome.moved_ns <= one.time_ns <= until_ns:
+            continue
+        before_ns = last_ns.get(one.identifier, one.time_ns)
+        longest_ns = max(longest_ns, one.time_ns - before_ns)
+        last_ns[one.identifier] = one.time_ns
+    return longest_ns * 1e-9 / CYCLE_S
 
 
 def judge_end(outcome: Round) -> None:
@@ -305,8 +426,9 @@ def judge_end(outcome: Round) -> None:
 def judge_code(outcome: Round) -> None:
     """Add what is wrong with the exit code and the words."""
     say, kinds = outcome.violations.append, outcome.kinds
-    allowed = ANY_CODES.union(*(CODES.get(kind, set()) for kind in kinds if isinstance(kind, Act)))
-    if outcome.code not in allowed:
+    allowed = allowed_codes(outcome)
+    came_to_its_end = outcome.code in UNSTOPPED_CODES and outcome.stopping
+    if outcome.code not in allowed and not came_to_its_end:
         say(f"(e) exit code {outcome.code}, expected one of {sorted(allowed)}: {outcome.said}")
     if not outcome.permitted and outcome.code in UNSTOPPED_CODES:
         say(f"(e) exit code {outcome.code} without permission to move: {outcome.said}")
@@ -316,7 +438,7 @@ def judge_code(outcome: Round) -> None:
         for fault in aborts:
             if f"node {fault.node})" not in words or "expect" not in words:
                 say(f"(e) no message names node {fault.node}, whose SDO abort ended the run: {outcome.said}")
-    if outcome.code in UNSTOPPED_CODES and outcome.stopping:
+    if came_to_its_end:
         faults = ", ".join(fault.name for fault, _ in outcome.stopping)
         say(f"(e) exit code {outcome.code} after {faults} in motion: {outcome.said}")
     scanned = "" if outcome.scanned is None else outcome.scanned[1]
@@ -365,10 +487,10 @@ def judge_permission(outcome: Round) -> None:
         node = one.identifier & 0x7F
         if node not in NODES:
             continue
-        if one.identifier & ~0x7F == RPDO1 and len(one.data) > TARGET_BYTES and one.data[TARGET_BYTES] & NEW_SETPOINT:
+        if is_setpoint(one.identifier, one.data):
             outcome.violations.append(f"(f) node {node} got a set-point without permission to move")
             return
-        if one.identifier & ~0x7F != TPDO1 or len(one.data) != FEEDBACK.size:
+        if not is_answer(one):
             continue
         if FEEDBACK.unpack(one.data)[2] & STATUSWORD_MASK == ENABLED:
             outcome.violations.append(f"(f) node {node} was enabled without permission to move")
@@ -425,6 +547,11 @@ def broken_chain(text: str, torn: bool = False) -> str:
             if torn:
                 continue
             return f"line {number} is no entry"
+        if not isinstance(entry, dict):
+            return f"line {number} is no entry"
+        absent = [key for key in CHAIN_KEYS if not isinstance(entry.get(key), str)]
+        if absent:
+            return f"line {number} lacks {' and '.join(absent)}"
         if entry["previous"] != previous:
             return f"line {number} does not follow the one before"
         digests = DIGEST.findall(line)

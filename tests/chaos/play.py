@@ -22,12 +22,11 @@ from tests.chaos.judge import (
     ALLOWANCE_S,
     ENABLED,
     GUARD_S,
-    NEW_SETPOINT,
     POWERED,
     RPDO1,
     STATUSWORD_MASK,
-    TARGET_BYTES,
     Round,
+    is_setpoint,
     judge,
 )
 from tests.chaos.processes import READY, Objects, Shared, Verb, serve_cell
@@ -171,7 +170,7 @@ def _strike(outcome: Round, stage: Stage) -> None:
         for identifier, data in stage.end.hear(0.002):
             if identifier >= HEARTBEAT + LOWEST_RECORDER:
                 stage.recorder_id = identifier - HEARTBEAT
-            elif not outcome.moved_ns and _is_setpoint(identifier, data):
+            elif not outcome.moved_ns and is_setpoint(identifier, data):
                 outcome.moved_ns, moved_s = time.time_ns(), time.monotonic()
         now_s = time.monotonic()
         for fault in [one for one in waiting if now_s >= _moment_s(one, begun_s, moved_s)]:
@@ -191,10 +190,6 @@ def _strike(outcome: Round, stage: Stage) -> None:
         time.sleep(max(0.0, min(due_s - time.monotonic(), 5.0)))
         with suppress(OSError):
             action()
-
-
-def _is_setpoint(identifier: int, data: bytes) -> bool:
-    return identifier & 0x780 == RPDO1 and len(data) > TARGET_BYTES and data[TARGET_BYTES] & NEW_SETPOINT != 0
 
 
 def _moment_s(fault: Fault, begun_s: float, moved_s: float) -> float:

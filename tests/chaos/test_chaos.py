@@ -66,7 +66,7 @@ def test_a_recording_that_came_to_its_end_after_a_fault_that_must_stop_it_is_fou
     before.moved_ns = STRUCK_NS + 1
     judge_end(before)
     judge_code(before)
-    assert before.violations == []
+    assert not [line for line in before.violations if before.faults[0].name in line]
 
 
 @pytest.mark.parametrize(

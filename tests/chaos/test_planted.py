@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 from drivers.simulation.faults import FaultKind
 from tests.chaos.faults import NODES, Act, Fault, Inside
-from tests.chaos.judge import ENABLED, FIRST, FilesSeen, Round, Written, broken_chain, judge
+from tests.chaos.judge import ENABLED, FIRST, FilesSeen, Round, Written, allowed_codes, broken_chain, judge
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
 from tests.vcan.log_reader import RUN, SAMPLES_TOPIC, STATISTICS
@@ -297,6 +297,52 @@ def fail_to_write(made: Scene) -> None:
     made.outcome.written[1] = Written("apply", 3, "refused")
 
 
+def hear_nothing(made: Scene) -> None:
+    made.outcome.frames.clear()
+    made.samples.clear()
+
+
+def hear_nothing_of_the_axes(made: Scene) -> None:
+    made.outcome.frames[:] = [one for one in made.outcome.frames if one.identifier & ~0x7F != TPDO1]
+    made.samples.clear()
+
+
+def hear_nothing_of_the_setpoints(made: Scene) -> None:
+    made.outcome.frames[:] = [one for one in made.outcome.frames if one.identifier & ~0x7F != 0x200]
+
+
+def change_the_second_line(made: Scene, change: Callable[[dict[str, object]], object]) -> None:
+    """Write the second line of the audit log anew, as JSON of what is made of its entry."""
+    lines = audit(4)
+    lines[1] = json.dumps(change(json.loads(lines[1])))
+    made.outcome.files[1] = replace(made.outcome.files[1], audit="\n".join(lines))
+
+
+def leave_out_the_link(made: Scene) -> None:
+    change_the_second_line(made, lambda entry: {key: one for key, one in entry.items() if key != "previous"})
+
+
+def leave_out_the_digest(made: Scene) -> None:
+    change_the_second_line(made, lambda entry: {key: one for key, one in entry.items() if key != "sha256"})
+
+
+def write_a_list_as_an_entry(made: Scene) -> None:
+    change_the_second_line(made, list)
+
+
+def end_with_a_code_that_nothing_explains(code: int) -> Callable[[Scene], None]:
+    """Strike with a fault that neither damages data nor stops the run."""
+
+    def plant(made: Scene) -> None:
+        harmless = replace(KILLED, kind=Act.SCREEN_STOPPED)
+        made.outcome.faults = (harmless,)
+        made.outcome.struck = [(harmless, made.outcome.struck[0][1])]
+        made.outcome.code = code
+
+    plant.__name__ = f"end_with_{code}_that_nothing_explains"
+    return plant
+
+
 PLANTS: list[tuple[Callable[[Scene], None], str]] = [
     (remove_a_sample, "(a, b)"),
     (remove_a_sample_of_a_valid_log, "(a, b)"),
@@ -323,6 +369,14 @@ PLANTS: list[tuple[Callable[[Scene], None], str]] = [
     (change_an_entry, "(h)"),
     (overlook_a_removal, "(h)"),
     (report_a_removal_that_was_none, "(h)"),
+    (leave_out_the_link, "(h)"),
+    (leave_out_the_digest, "(h)"),
+    (write_a_list_as_an_entry, "(h)"),
+    (end_with_a_code_that_nothing_explains(4), "(e)"),
+    (end_with_a_code_that_nothing_explains(5), "(e)"),
+    (hear_nothing, "(listener)"),
+    (hear_nothing_of_the_axes, "(listener)"),
+    (hear_nothing_of_the_setpoints, "(listener)"),
 ]
 
 
@@ -370,8 +424,21 @@ def test_a_planted_violation_is_reported(
     assert {line.partition(") ")[0] + ")" for line in found} == {letter}
 
 
+@pytest.mark.parametrize(("cycles", "explained"), [(1, {0}), (2, {0, 4}), (5, {0, 4, 5})])
+def test_a_stall_that_the_listener_heard_explains_a_code(cycles: int, explained: set[int]) -> None:
+    made = scene()
+    end_with_a_code_that_nothing_explains(5)(made)
+    begin_ns = FIRST_SYNC_NS + 30 * PERIOD_NS
+    stalled_ns = (cycles - 1) * PERIOD_NS
+    frames = made.outcome.frames
+    for place, frame in enumerate(frames):
+        if frame.time_ns >= begin_ns:
+            frames[place] = frame._replace(time_ns=frame.time_ns + stalled_ns)
+    assert allowed_codes(made.outcome) == explained
+
+
 def test_a_violation_is_planted_for_each_of_the_things_that_must_hold() -> None:
-    assert {letter for _, letter in PLANTS} == {"(a, b)", "(c)", "(d)", "(e)", "(f)", "(g)", "(h)"}
+    assert {letter for _, letter in PLANTS} == {"(listener)", "(a, b)", "(c)", "(d)", "(e)", "(f)", "(g)", "(h)"}
 
 
 def test_the_unfinished_line_of_a_killed_writer_breaks_no_chain() -> None:

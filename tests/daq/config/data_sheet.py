@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from configparser import RawConfigParser
+from copy import copy
 from io import StringIO
 
-from canopen.objectdictionary import ObjectDictionary, ODVariable
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 
@@ -23,26 +25,54 @@ _EMPTY_FIELD = re.compile(r"^(?:PDOMapping|ObjectType|SubNumber)=[ \t\r]*$", re.
 """Fields of an object that real data sheets leave empty and canopen cannot read."""
 
 
-def data_sheet(text: bytes, name: str) -> ObjectDictionary:
+_OCTAL = re.compile(
+    r"^([A-Za-z]+[ \t]*=[ \t]*(?:\$NODEID[ \t]*\+[ \t]*)?)0([0-7]+)(?=[ \t]*(?:\+|\r?$))", re.MULTILINE | re.IGNORECASE
+)
+"""Octal numbers as CiA 306 has them, with a leading 0; canopen reads those of Python, with 0o."""
+
+
+def data_sheet(text: bytes, name: str, node_id: int | None = None) -> ObjectDictionary:
     """Read a data sheet.
 
     Args:
         text: content of the file.
         name: name of the file in messages.
+        node_id: for defaults that depend on it; without it they are absent.
 
     Raises:
         ValueError: it is not a data sheet.
     """
     if len(text) > LARGEST_BYTES:
         raise ValueError(_message(name, f"{len(text)} bytes"))
-    stream = StringIO(_EMPTY_FIELD.sub("", text.decode("latin-1")))
+    complete = _EMPTY_FIELD.sub("", text.decode("latin-1"))
+    readable = _OCTAL.sub(r"\g<1>0o\g<2>", complete)
     try:
-        sheet: ObjectDictionary = import_eds(stream, None)
+        sheet: ObjectDictionary = import_eds(StringIO(readable), node_id)
+        _complete_compact_arrays(sheet, readable)
     except Exception as error:  # canopen raises errors of many kinds for a file that is not a data sheet
         raise ValueError(_message(name, f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}")) from error
     if not any(index >= 0x1000 for index in sheet):
         raise ValueError(_message(name, "no objects"))
     return sheet
+
+
+def _complete_compact_arrays(sheet: ObjectDictionary, text: str) -> None:
+    """Add the elements behind the first of arrays by CompactSubObj; those that canopen makes lack PDOMapping."""
+    parser = RawConfigParser(inline_comment_prefixes=(";",), strict=False)
+    parser.read_string(text)
+    for section in parser.sections():
+        count = parser.get(section, "CompactSubObj", fallback="")
+        if not count or re.fullmatch("[0-9A-Fa-f]{4}", section) is None:
+            continue
+        array = sheet[int(section, 16)]
+        if not isinstance(array, ODArray):
+            continue
+        for subindex in range(2, int(count, 0) + 1):
+            if subindex not in array.subindices:
+                element = copy(array.subindices[1])
+                element.subindex = subindex
+                element.name = f"{array.subindices[1].name}_{subindex:x}"
+                array.add_member(element)
 
 
 def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, ...]:
