@@ -1,1 +1,1 @@
-"""The live console: a page for the technician beside a recording, in a process of its own."""
+"""The live console: a page for the technician during a recording, in a process of its own."""

@@ -64,9 +64,9 @@ UNKNOWN = "this page could not follow the recorder, and does not know how it end
 class Ring:
     """The last entries of a growing list; readers keep the number of the next entry that they have not seen."""
 
-    def __init__(self, kept: int) -> None:
+    def __init__(self, size: int) -> None:
         self.end = 0  #: Number of entries ever
-        self._entries: deque[Any] = deque(maxlen=kept)
+        self._entries: deque[Any] = deque(maxlen=size)
 
     def add(self, entries: Sequence[Any]) -> None:
         """Append entries; the oldest are forgotten."""
@@ -74,25 +74,33 @@ class Ring:
         self.end += len(entries)
 
     def since(self, seen: int) -> list[Any]:
-        """Return what is kept of the entries from that number on."""
+        """Return the entries from that number on, without those that were forgotten."""
         new = min(self.end - seen, len(self._entries))
-        return [] if new <= 0 else [self._entries[index] for index in range(-new, 0)]
+        if new <= 0:
+            return []
+        return [self._entries[index] for index in range(-new, 0)]
 
 
 class Reader:
-    """Keeps the place of one reader in the curves."""
+    """Remembers the place of one reader in the curves."""
 
     def __init__(self, live: Live) -> None:
-        self._live, self._epoch, self._seen = live, -1, [0, 0, 0]
+        self._live = live
+        self._epoch = -1
+        self._seen = [0, 0, 0]
 
     def news(self) -> tuple[bool, dict[str, list[Any]]]:
         """Return whether another run has begun, and the new points, rows and events."""
-        live, begun = self._live, self._epoch != self._live.epoch
+        live = self._live
+        begun = self._epoch != self._live.epoch
         if begun:
-            self._epoch, self._seen = live.epoch, [0, 0, 0]
+            self._epoch = live.epoch
+            self._seen = [0, 0, 0]
         found = {}
-        for place, (name, ring) in enumerate((("points", live.points), ("rows", live.rows), ("events", live.events))):
-            if new := ring.since(self._seen[place]):
+        rings = {"points": live.points, "rows": live.rows, "events": live.events}
+        for place, (name, ring) in enumerate(rings.items()):
+            new = ring.since(self._seen[place])
+            if new:
                 found[name] = new
             self._seen[place] = ring.end
         return begun, found
@@ -105,7 +113,7 @@ class Live:
         self.cell = cell
         self._clock = clock  # [s]
         self.calibration: Calibration | None = None
-        self.epoch = 0  #: Number of the run; readers begin anew when it changes
+        self.epoch = 0  #: Number of the run; readers begin again when it changes
         self.run: RunFacts | None = None
         self.phase = "waiting"  #: Also running (a recorder), watching (a monitor) and ended
         self.end: dict[str, Any] | None = None  #: How the program ended
@@ -122,10 +130,15 @@ class Live:
 
     def _clear(self, phase: str, run: RunFacts | None) -> None:
         self.epoch += 1
-        self.phase, self.run, self.remark, self._unfit = phase, run, "", ""
+        self.phase = phase
+        self.run = run
+        self.remark = ""
+        self._unfit = ""
         if phase != "watching":  # how the last recording ended stays on the page
             self.result = self.end = self.quick = None
-        self.points, self.rows, self.events = Ring(KEPT_POINTS), Ring(KEPT_POINTS), Ring(KEPT_EVENTS)
+        self.points = Ring(KEPT_POINTS)
+        self.rows = Ring(KEPT_POINTS)
+        self.events = Ring(KEPT_EVENTS)
         self.samples = self.lost = self.missing = self.dropped = self.done = 0
         self._number: int | None = None
         self._last: Any = None
@@ -160,7 +173,9 @@ class Live:
         if self._number is not None and found.number > self._number:
             self.dropped += found.number - self._number - 1
         self._number = found.number
-        self.samples, self.lost, self.missing = found.samples, found.lost, found.missing
+        self.samples = found.samples
+        self.lost = found.lost
+        self.missing = found.missing
         self._rate.append((self._came_s, found.samples))
         if found.rows is not None and self.run is not None:
             self._take_samples(found.rows)
@@ -186,7 +201,8 @@ class Live:
     def _finish(self, end: ProgramEnd) -> None:
         if self.phase != "watching":  # a monitor's end says nothing of the axes
             self.end = asdict(end)
-        self.phase, self._unfit = "ended", ""
+        self.phase = "ended"
+        self._unfit = ""
 
     def _shown(self, event: CellEvent) -> dict[str, Any]:
         """Return an event for the page: time since the start of the run, axis by name, and the remedy."""
@@ -197,9 +213,12 @@ class Live:
         if event.kind is EventKind.STATE and event.axis is not None:
             # The stop after a fault has no samples, but its states are events.
             self._words[event.axis] = event.code
-        axis = None if event.axis is None else self.cell.axis_names[event.axis]
+        axis = None
+        if event.axis is not None:
+            axis = self.cell.axis_names[event.axis]
         time_s = 1e-9 * (event.time_ns - self.origin_ns)
-        return {"time_s": round(time_s, 6), **asdict(notice_of(event.kind, event.code, axis, event.text))}
+        notice = notice_of(event.kind, event.code, axis, event.text)
+        return {"time_s": round(time_s, 6), **asdict(notice)}
 
     def _take_samples(self, samples: Any) -> None:
         if self.origin_ns is None:
@@ -208,18 +227,23 @@ class Live:
         current = samples["current_raw"] * self._scale.current_per_unit
         shown = samples["cycle"] % self._every == 0
         times = 1e-9 * (samples["time_ns"] - self.origin_ns)
-        self.points.add(np.column_stack((times, position / self._unit, current))[shown].tolist())
-        self._last, self._words = samples[-1], samples[-1]["statusword"].tolist()
+        points = np.column_stack((times, position / self._unit, current))
+        self.points.add(points[shown].tolist())
+        self._last = samples[-1]
+        self._words = samples[-1]["statusword"].tolist()
         if self._predictor is not None and not self.remark:
             self._predict(samples, position, current, float(times[-1]))
 
     def _predict(self, samples: Any, position: FloatArray, current: FloatArray, last_s: float) -> None:
         assert self._predictor is not None and self.run is not None
-        cycle, whole = samples["cycle"].astype(np.int64), samples["missing"] == 0
+        cycle = samples["cycle"].astype(np.int64)
+        complete = samples["missing"] == 0
         try:
-            for rows in self._predictor.take(cycle[whole], position[whole], current[whole]):
-                times = last_s - (cycle[-1] - rows.cycle) / self.run.rate_hz
-                self.rows.add(np.column_stack((times, rows.predicted, rows.residual)).tolist())
+            for rows in self._predictor.take(cycle[complete], position[complete], current[complete]):
+                cycles_ago = cycle[-1] - rows.cycle
+                times = last_s - cycles_ago / self.run.rate_hz
+                curves = np.column_stack((times, rows.predicted, rows.residual))
+                self.rows.add(curves.tolist())
                 self._band = rows.band.tolist()
         except IdentificationError as error:
             self.remark = f"no prediction: {error}"
@@ -231,20 +255,36 @@ class Live:
         if self.run is not None and not self._is_simulated:
             computed = self.run.bus_load
             share = self.rate_hz / self.run.rate_hz
+        axes = []
+        if self._last is not None:
+            axes = self._axes(self._last)
+        moves = 0
+        if self.run is not None:
+            moves = self.run.moves
+        bus_load = self._measured
+        if not bus_load:
+            bus_load = {bus: share * load for bus, load in computed.items()}
+        old = bool(self._silent_s) or bool(self.failed)
         return {
             "phase": self.phase,
-            "axes": [] if self._last is None else self._axes(self._last),
-            **{"samples": self.samples, "lost": self.lost, "missing": self.missing, "dropped": self.dropped},
+            "axes": axes,
+            "samples": self.samples,
+            "lost": self.lost,
+            "missing": self.missing,
+            "dropped": self.dropped,
             "rate_hz": round(self._shown_rate_hz, 1),
             "simulated": self._is_simulated,
-            "moves": 0 if self.run is None else self.run.moves,
+            "moves": moves,
             "done": self.done,
-            "bus_load": self._measured or {bus: share * load for bus, load in computed.items()},
+            "bus_load": bus_load,
             "free_bytes": self._free_bytes(),
             "band": self._band,
             "alarm": self._alarm(),
-            "old": bool(self._silent_s) or bool(self.failed),
-            **{"remark": self.remark, "result": self.result, "end": self.end, "stop": self.stop_state},
+            "old": old,
+            "remark": self.remark,
+            "result": self.result,
+            "end": self.end,
+            "stop": self.stop_state,
             "quick": self.quick,
         }
 
@@ -253,7 +293,9 @@ class Live:
         if self.failed or self._unfit or not self._silent_s:
             return self.failed or self._unfit
         said = f"Nothing has come for {self._silent_s} s; states and values below are of that time"
-        return f"{said}. {HANGS}" if self.phase == "running" else said
+        if self.phase == "running":
+            return f"{said}. {HANGS}"
+        return said
 
     @property
     def _silent_s(self) -> int:
@@ -261,36 +303,46 @@ class Live:
         if not self.samples or self.result is not None or self.phase not in OLD_S:
             return 0  # before the first sample and between two runs there is nothing to send
         silent_s = self._clock() - self._came_s
-        return int(silent_s) if silent_s > OLD_S[self.phase] else 0
+        if silent_s > OLD_S[self.phase]:
+            return int(silent_s)
+        return 0
 
     def _axes(self, last: Any) -> list[dict[str, Any]]:
-        position = self._scale.joint_position(last["position_counts"].astype(np.int64)) / self._unit
+        counts = last["position_counts"].astype(np.int64)
+        position = self._scale.joint_position(counts) / self._unit
         current = last["current_raw"] * self._scale.current_per_unit
-        return [
-            {
-                "state": str(state := decode(word)),
+        missing = int(last["missing"])
+        axes = []
+        for index, word in enumerate(self._words):
+            state = decode(word)
+            axis = {
+                "state": str(state),
                 "power": state in ENABLED,
                 "fault": state in FAULTY,
-                "silent": bool(int(last["missing"]) >> index & 1),
+                "silent": bool(missing >> index & 1),
                 "position": float(position[index]),
                 "current": float(current[index]),
             }
-            for index, word in enumerate(self._words)
-        ]
+            axes.append(axis)
+        return axes
 
     @property
     def rate_hz(self) -> float:
         """Samples a second by this computer's clock, over the last packets."""
-        if len(self._rate) < 2 or self._silent_s or self.phase not in ("running", "watching"):
+        if len(self._rate) < 2 or self._silent_s:
             return 0.0
-        (begin_s, first), (end_s, last) = self._rate[0], self._rate[-1]
-        if end_s - begin_s < RATE_S:
+        if self.phase not in ("running", "watching"):
+            return 0.0
+        begin_s, first = self._rate[0]
+        end_s, last = self._rate[-1]
+        duration_s = end_s - begin_s
+        if duration_s < RATE_S:
             return 0.0  # packets that wait for the page arrive together
-        return (last - first) / (end_s - begin_s)
+        return (last - first) / duration_s
 
     @property
     def _is_simulated(self) -> bool:
-        """Whether the cell runs in lockstep: as fast as its computer can, in a time of its own, on no real bus."""
+        """Whether the cell runs in lockstep: as fast as its computer can, in simulated time, on no real bus."""
         return self.cell.sync is not None and self.cell.sync.pacing is PacingMode.LOCKSTEP
 
     @property
@@ -301,10 +353,15 @@ class Live:
         return self.rate_hz
 
     def _free_bytes(self) -> int | None:
-        if self.run is not None and self.run.log is not None and time.monotonic() - self._free_s > DISK_S:
-            self._free, self._free_s = None, time.monotonic()
+        if self.run is None or self.run.log is None:
+            return self._free
+        now_s = time.monotonic()
+        if now_s - self._free_s > DISK_S:
+            self._free = None
+            self._free_s = now_s
             with suppress(OSError):
-                self._free = shutil.disk_usage(Path(self.run.log).parent).free
+                disk = shutil.disk_usage(Path(self.run.log).parent)
+                self._free = disk.free
         return self._free
 
     async def follow(self) -> None:
@@ -342,7 +399,9 @@ class Live:
     def _refuse(self, phase: str, error: FeedUnfit) -> None:
         if not self._unfit:
             self._clear(phase, None)
-        program = "recorder" if phase == "running" else "monitor"
+        program = "monitor"
+        if phase == "running":
+            program = "recorder"
         self._unfit = f"This page cannot show the {program}: {error}. Restart the console, with the same drivegain"
 
     async def _take_all(self, connection: socket.socket, phase: str) -> None:
@@ -376,16 +435,23 @@ class Live:
     async def stop(self) -> dict[str, Any]:
         """Ask the recorder to stop its axes, and return its answer; how it ended comes later, in `stop_state`."""
         asked = time.strftime("%H:%M:%S")
-        place, recorder = socket_names(self._file).stop, self._recorder
+        place = socket_names(self._file).stop
+        recorder = self._recorder
         connection = await asyncio.to_thread(connected, place, socket.SOCK_STREAM, STOP_ACCEPTED_S)
-        answer = b"" if connection is None else await asyncio.to_thread(_ask, connection)
+        answer = b""
+        if connection is not None:
+            answer = await asyncio.to_thread(_ask, connection)
         if connection is None or answer != ACCEPTED:
-            found = "the recorder did not answer" if connection else "this console reaches no recorder of this cell"
+            found = "this console reaches no recorder of this cell"
+            if connection:
+                found = "the recorder did not answer"
             text = f"{found}; if the robot moves, use the emergency stop"
             self.stop_state = {"accepted": False, "at": asked, "text": text}
             return self.stop_state
-        self.stop_state = {"accepted": True, "at": asked, "text": "the recorder stops the axes"}
-        task = asyncio.create_task(self._await_end(connection, asked, recorder))
+        text = "the recorder stops the axes"
+        self.stop_state = {"accepted": True, "at": asked, "text": text}
+        end = self._await_end(connection, asked, recorder)
+        task = asyncio.create_task(end)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return self.stop_state
@@ -398,10 +464,14 @@ class Live:
         connection.settimeout(STOP_ENDED_S)
         ended: dict[str, Any] = {}
         with connection, suppress(OSError, ValueError):
-            ended = json.loads(await asyncio.to_thread(connection.recv, LARGEST_PACKET))
-        sure = bool(ended.get("axes_stopped"))
-        text = "the recorder has ended, its axes are stopped" if sure else f"NOT CONFIRMED: {ended.get('text', GONE)}"
-        self._note_stop({"accepted": True, "at": asked, "text": text, "axes_stopped": sure}, recorder)
+            packet = await asyncio.to_thread(connection.recv, LARGEST_PACKET)
+            ended = json.loads(packet)
+        is_stopped = bool(ended.get("axes_stopped"))
+        text = "the recorder has ended, its axes are stopped"
+        if not is_stopped:
+            text = f"NOT CONFIRMED: {ended.get('text', GONE)}"
+        state = {"accepted": True, "at": asked, "text": text, "axes_stopped": is_stopped}
+        self._note_stop(state, recorder)
 
 
 def _ask(connection: socket.socket) -> bytes:

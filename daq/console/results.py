@@ -22,7 +22,7 @@ from daq.jobs.position import position_of, sessions_folder
 from daq.jobs.reporting import Conclusion, to_do
 from daq.jobs.session import CALIBRATION, REPORT, Session, begun_until, sessions
 from daq.ledger.ledger import MAY_LACK, Ledger, read_history
-from daq.ledger.watch import alarm_text, watch
+from daq.ledger.watch import Series, alarm_text, watch
 from daq.report.residual_page import PAGE
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
@@ -44,7 +44,10 @@ class Results:
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         """Store the places that may be read; calibration and folder of the report are those of the command line."""
-        self._cell_file, self._cell, self._calibration, self._report = cell_file, cell, calibration, report
+        self._cell_file = cell_file
+        self._cell = cell
+        self._calibration = calibration
+        self._report = report
         self._now = now
         self._read: dict[Path, tuple[tuple[int, int], Calibration]] = {}
 
@@ -55,14 +58,20 @@ class Results:
             DaqError: it cannot be read.
         """
         newest = self._newest()
-        path = self._calibration or (None if newest is None else newest.folder / CALIBRATION)
+        path = self._calibration
+        if path is None and newest is not None:
+            path = newest.folder / CALIBRATION
         if path is None or not path.exists():
             return None
         status = path.stat()
-        mark = status.st_mtime_ns, status.st_size
-        if path not in self._read or self._read[path][0] != mark:
-            self._read = {path: (mark, load_calibration(path))}
-        return path, self._read[path][1]
+        mark = (status.st_mtime_ns, status.st_size)
+        if path in self._read:
+            mark_read, calibration = self._read[path]
+            if mark_read == mark:
+                return path, calibration
+        calibration = load_calibration(path)
+        self._read = {path: (mark, calibration)}
+        return path, calibration
 
     def report(self) -> bytes | None:
         """Return the page of the report, that of the command line or of the newest session; None without one."""
@@ -74,41 +83,58 @@ class Results:
     def document(self) -> dict[str, Any]:
         """Return everything for the page; a file that cannot be read is a sentence in `problems`."""
         problems: list[str] = []
-        found: dict[str, Any] = {"problems": problems, "report": self._report_path() is not None}
-        for name, read in (
-            ("gains", self._gains),
-            ("history", self._history),
-            ("session", self._session),
-            ("guided", self._guided),
-        ):
+        has_report = self._report_path() is not None
+        found: dict[str, Any] = {"problems": problems, "report": has_report}
+        parts: dict[str, Callable[[], Any]] = {
+            "gains": self._gains,
+            "history": self._history,
+            "session": self._session,
+            "guided": self._guided,
+        }
+        for name, read in parts.items():
             try:
                 found[name] = read()
+            except (DaqError, IdentificationError, OSError) as error:
+                found[name] = None
+                problems.append(str(error))
             except UNREADABLE as error:
                 found[name] = None
-                known = isinstance(error, DaqError | IdentificationError | OSError)
-                problems.append(str(error) if known else f"{name} cannot be shown, a file does not fit: {error}")
+                problems.append(f"{name} cannot be shown, a file does not fit: {error}")
         return found
 
     def _newest(self) -> Session | None:
         """Return the session of the job or of `calibrate` that was begun last; None without either."""
-        newest = [one for one in (self._newest_job(), self._newest_guided()) if one is not None]
-        return max(newest, key=lambda session: session.began, default=None)
+        candidates = (self._newest_job(), self._newest_guided())
+        found = [session for session in candidates if session is not None]
+        return max(found, key=lambda session: session.began, default=None)
 
     def _newest_job(self) -> Session | None:
         section = self._cell.recalibration
-        return None if section is None else self._newest_in(section.folder)
+        if section is None:
+            return None
+        return self._newest_in(section.folder)
 
     def _newest_guided(self) -> Session | None:
         return self._newest_in(sessions_folder(self._cell_file))
 
     def _newest_in(self, folder: Path) -> Session | None:
-        past = begun_until(sessions(folder, self._cell.name), self._now())
-        return past[-1] if past else None
+        all_sessions = sessions(folder, self._cell.name)
+        past = begun_until(all_sessions, self._now())
+        if past:
+            return past[-1]
+        return None
 
     def _report_path(self) -> Path | None:
         newest = self._newest()
-        folder = self._report or (None if newest is None else newest.folder / REPORT)
-        return None if folder is None or not (folder / PAGE).is_file() else folder / PAGE
+        folder = self._report
+        if folder is None and newest is not None:
+            folder = newest.folder / REPORT
+        if folder is None:
+            return None
+        page = folder / PAGE
+        if not page.is_file():
+            return None
+        return page
 
     def _gains(self) -> dict[str, Any] | None:
         known = self.calibration()
@@ -123,18 +149,28 @@ class Results:
                 expected=mismatch.expected,
                 remedy="give the calibration of this cell",
             )
-        error = calibration.holdout_error_percent or calibration.relative_error_percent
+        error = calibration.holdout_error_percent
+        measured_on = "held-out runs"
+        if error is None:
+            error = calibration.relative_error_percent
+            measured_on = "the fit's own runs"
+        axes = []
+        for gain, error_percent in zip(calibration.gains, error.axes, strict=True):
+            axis = {
+                "axis": gain.axis,
+                "unit": gain.unit,
+                "value": gain.value,
+                "std": gain.std,
+                "nameplate": gain.nameplate,
+                "change_percent": gain.change_percent,
+                "error_percent": error_percent,
+            }
+            axes.append(axis)
         return {
             "file": path.name,
             "created": calibration.created,
-            "error": "held-out runs" if calibration.holdout_error_percent is not None else "the fit's own runs",
-            "axes": [
-                {
-                    **{"axis": gain.axis, "unit": gain.unit, "value": gain.value, "std": gain.std},
-                    **{"nameplate": gain.nameplate, "change_percent": gain.change_percent, "error_percent": percent},
-                }
-                for gain, percent in zip(calibration.gains, error.axes, strict=True)
-            ],
+            "error": measured_on,
+            "axes": axes,
         }
 
     def _history(self) -> dict[str, Any] | None:
@@ -145,19 +181,15 @@ class Results:
         if not history.entries and not history.may_lack:
             return None
         series = watch(history.entries, history.acknowledgements)
+        problem = None
+        if history.may_lack:
+            problem = MAY_LACK
+        cell_file = shlex.quote(str(self._cell_file))
         return {
             "calibrations": len(history.entries),
-            "problem": MAY_LACK if history.may_lack else None,
-            "axes": [
-                {
-                    "axis": one.axis,
-                    "change_percent": None if one.drift is None or len(one.points) < 2 else one.drift.change_percent,
-                    "change_sigmas": None if one.drift is None or len(one.points) < 2 else one.drift.change_sigmas,
-                    "alarm": alarm_text(one),
-                }
-                for one in series
-            ],
-            "command": f"drivegain history {shlex.quote(str(self._cell_file))}",
+            "problem": problem,
+            "axes": [_axis_history(one) for one in series],
+            "command": f"drivegain history {cell_file}",
         }
 
     def _guided(self) -> dict[str, Any] | None:
@@ -180,7 +212,10 @@ class Results:
         if state.progress and state.gains:
             found["precision"] = _precision(self._cell, state)
         if state.acceptance is not None:
-            found["acceptance"] = {"accepted": state.acceptance.accepted, "remark": state.acceptance.remark}
+            found["acceptance"] = {
+                "accepted": state.acceptance.accepted,
+                "remark": state.acceptance.remark,
+            }
         return found
 
     def _session(self) -> dict[str, Any] | None:
@@ -189,19 +224,45 @@ class Results:
             return None
         state = newest.state
         outcome = state.outcome
-        ended = None
+        outcome_text = "not finished"
+        steps: list[str] = []
         if outcome is not None:
-            ended = Conclusion(outcome, state.exit_code or ExitCode.OK, newest, state.problem)
+            outcome_text = outcome.value
+            exit_code = state.exit_code or ExitCode.OK
+            ended = Conclusion(outcome, exit_code, newest, state.problem)
+            steps = to_do(ended, self._cell_file)
+        kind = "Scheduled recalibration"
+        if isinstance(state, GuidedState):
+            kind = "Session"
+        runs = [{"name": run.name, "samples": run.samples} for run in state.runs]
+        sentences = []
+        if state.fitted is not None:
+            sentences = list(state.fitted.sentences)
         return {
             "session": state.session,
-            "kind": "Session" if isinstance(state, GuidedState) else "Scheduled recalibration",
-            "outcome": "not finished" if outcome is None else outcome.value,
+            "kind": kind,
+            "outcome": outcome_text,
             "waits": outcome is Outcome.PROPOSED,
             "problem": state.problem,
-            "runs": [{"name": run.name, "samples": run.samples} for run in state.runs],
-            "sentences": [] if state.fitted is None else list(state.fitted.sentences),
-            "to_do": [] if ended is None else to_do(ended, self._cell_file),
+            "runs": runs,
+            "sentences": sentences,
+            "to_do": steps,
         }
+
+
+def _axis_history(series: Series) -> dict[str, Any]:
+    """Return the drift of one axis; null where there are fewer than two calibrations."""
+    change_percent = None
+    change_sigmas = None
+    if series.drift is not None and len(series.points) >= 2:
+        change_percent = series.drift.change_percent
+        change_sigmas = series.drift.change_sigmas
+    return {
+        "axis": series.axis,
+        "change_percent": change_percent,
+        "change_sigmas": change_sigmas,
+        "alarm": alarm_text(series),
+    }
 
 
 def _precision(cell: Cell, state: GuidedState) -> dict[str, Any]:
@@ -209,11 +270,14 @@ def _precision(cell: Cell, state: GuidedState) -> dict[str, Any]:
     worst = max(state.gains, key=lambda gain: gain.std_percent / gain.target_percent)
     last = state.progress[-1]
     judged = state.blocks[: last.blocks]
+    progress = [one.model_dump(mode="json") for one in state.progress]
+    block_s = last.motion_s / last.blocks
+    left_s = motion_left_s(cell, state.gains, judged, block_s)
     return {
         "axes": [gain.axis for gain in state.gains],
         "target_percent": state.gains[0].target_percent,
-        "progress": [one.model_dump(mode="json") for one in state.progress],
+        "progress": progress,
         "worst": worst.axis,
         "why": worst.cause,
-        "left_s": motion_left_s(cell, state.gains, judged, last.motion_s / last.blocks),
+        "left_s": left_s,
     }

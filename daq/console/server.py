@@ -28,7 +28,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, CellAxis
 from daq.console.live import KEPT_POINTS, Live, Reader
 from daq.console.results import UNREADABLE, Results
 from daq.report.document import json_safe
@@ -57,7 +57,9 @@ class Guard:
     """Refuses requests of other hosts, other origins and without the token, before anything else sees them."""
 
     def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
-        self._app, self._token, self._hosts = app, token.encode(), hosts
+        self._app = app
+        self._token = token.encode()
+        self._hosts = hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it with the refusal."""
@@ -67,9 +69,12 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                there = {name for name, _ in message["headers"]}
-                more = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message["headers"], *(one for one in more if one[0] not in there)]
+                headers = list(message["headers"])
+                present = {name for name, _ in headers}
+                for name, value in HEADERS.items():
+                    if name.encode() not in present:
+                        headers.append((name.encode(), value.encode()))
+                message["headers"] = headers
             await send(message)
 
         refusal = self._refusal(scope)
@@ -83,25 +88,37 @@ class Guard:
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
-        hosts, origins = headers.getlist("host"), headers.getlist("origin")
+        hosts = headers.getlist("host")
+        origins = headers.getlist("origin")
         if len(hosts) != 1 or hosts[0] not in self._hosts:
             return PlainTextResponse("this server has another name: open the address that was printed", 421)
         own = {f"http://{host}" for host in self._hosts}
-        elsewhere = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
-        if not set(origins) <= own or elsewhere or (scope["method"] == "POST" and not origins):
+        site = headers.get("sec-fetch-site", "none")
+        is_foreign = not set(origins) <= own or site not in ("none", "same-origin")
+        is_anonymous_post = scope["method"] == "POST" and not origins
+        if is_foreign or is_anonymous_post:
             return PlainTextResponse("only the console's own page may ask", 403)
         token = scope["path"].removeprefix("/").partition("/")[0]  # "*" is a path as well (RFC 9112, OPTIONS)
-        return None if hmac.compare_digest(token.encode(), self._token) else PlainTextResponse("not found", 404)
+        if hmac.compare_digest(token.encode(), self._token):
+            return None
+        return PlainTextResponse("not found", 404)
 
 
 class Page:
     """The answers."""
 
     def __init__(
-        self, cell: Cell, live: Live, results: Results, *beside: Callable[[], Coroutine[Any, Any, None]]
+        self,
+        cell: Cell,
+        live: Live,
+        results: Results,
+        *background: Callable[[], Coroutine[Any, Any, None]],
     ) -> None:
-        """Store the arguments; what is given after the results runs beside the server."""
-        self._cell, self._live, self._results, self._beside = cell, live, results, beside
+        """Store the arguments; `background` runs together with the server."""
+        self._cell = cell
+        self._live = live
+        self._results = results
+        self._parts = (live.follow, self._look, *background)
         self._document: dict[str, Any] = {}
         self.over: Callable[[], bool] = lambda: False  #: Whether the server ends
         self._readers = 0  # pages that have asked for the curves
@@ -122,7 +139,7 @@ class Page:
 
     @asynccontextmanager
     async def _background(self, _: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(one()) for one in (self._live.follow, self._look, *self._beside)]
+        tasks = [asyncio.create_task(part()) for part in self._parts]
         for task in tasks:
             task.add_done_callback(self._note_end)
         yield
@@ -140,7 +157,9 @@ class Page:
         while True:
             with suppress(*UNREADABLE):  # the document has the reason
                 known = await asyncio.to_thread(self._results.calibration)
-                self._live.calibration = None if known is None else known[1]
+                self._live.calibration = None
+                if known is not None:
+                    self._live.calibration = known[1]
             try:
                 self._document = await asyncio.to_thread(self._results.document)
             except UNREADABLE as error:
@@ -158,20 +177,13 @@ class Page:
 
     async def _facts(self, _: Request) -> Response:
         """Facts of the cell that do not change."""
-        axes = [
-            {
-                "name": axis.name,
-                "unit": axis.unit.name,
-                "lower": axis.limits.position[0] / axis.unit.si,
-                "upper": axis.limits.position[1] / axis.unit.si,
-                "current_unit": axis.gain_unit.partition("/")[2],
-            }
-            for axis in self._cell.axes
-        ]
-        return JSONResponse({"cell": self._cell.name, "axes": axes, "kept_points": KEPT_POINTS})
+        axes = [_axis_facts(axis) for axis in self._cell.axes]
+        facts = {"cell": self._cell.name, "axes": axes, "kept_points": KEPT_POINTS}
+        return JSONResponse(facts)
 
     async def _shown_results(self, _: Request) -> Response:
-        return Response(_json({**self._document, "stop": self._live.stop_state}), media_type="application/json")
+        document = {**self._document, "stop": self._live.stop_state}
+        return Response(_json(document), media_type="application/json")
 
     async def _report(self, _: Request) -> Response:
         with suppress(*UNREADABLE):
@@ -194,7 +206,9 @@ class Page:
         self._readers += change
 
     async def _messages(self) -> AsyncIterator[bytes]:
-        live, reader, before = self._live, Reader(self._live), b""
+        live = self._live
+        reader = Reader(self._live)
+        before = b""
         while not self.over():
             begun, news = reader.news()
             message: dict[str, Any] = {**news}
@@ -205,6 +219,17 @@ class Page:
                 before = status
                 yield b'data: {"status": %b, "new": %b}\n\n' % (status, _json(message))
             await asyncio.sleep(TICK_S)
+
+
+def _axis_facts(axis: CellAxis) -> dict[str, Any]:
+    lower, upper = axis.limits.position
+    return {
+        "name": axis.name,
+        "unit": axis.unit.name,
+        "lower": lower / axis.unit.si,
+        "upper": upper / axis.unit.si,
+        "current_unit": axis.gain_unit.partition("/")[2],
+    }
 
 
 class _Curves(StreamingResponse):
@@ -235,7 +260,8 @@ class _Connection(H11Protocol):
         self.loop.call_later(REQUEST_S, self._close_unasked)
         waiting = [one for one in self.connections if isinstance(one, _Connection) and not one.headers]
         if len(waiting) > CONNECTIONS:
-            min(waiting, key=lambda one: one._begun_s)._close_unasked()
+            longest = min(waiting, key=lambda one: one._begun_s)
+            longest._close_unasked()
 
     def _close_unasked(self) -> None:
         if not self.headers:  # of its first request

@@ -1,4 +1,4 @@
-"""The curves as a stream for Foxglove, which shows them live beside its 3-D view of the arm.
+"""The curves as a stream for Foxglove, which shows them live next to its 3-D view of the arm.
 
 The topics are those of a log: `/joint_states`, `/cell/currents`, `/cell/events` and `/robot_description`; with a
 calibration also `/cell/predicted` and `/cell/residual`, which a log does not have. The layout in `configs/viewers`
@@ -37,9 +37,13 @@ from daq.log.message import (
 from drivers.messages import CellEvent, EventKind
 from ident.arrays import FloatArray
 
-PREDICTED_TOPIC, RESIDUAL_TOPIC = "/cell/predicted", "/cell/residual"
+PREDICTED_TOPIC = "/cell/predicted"
+RESIDUAL_TOPIC = "/cell/residual"
 SCHEMAS = {
-    **{topic: SCHEMA_OF[topic] for topic in (JOINTS_TOPIC, CURRENTS_TOPIC, EVENTS_TOPIC, URDF_TOPIC)},
+    JOINTS_TOPIC: SCHEMA_OF[JOINTS_TOPIC],
+    CURRENTS_TOPIC: SCHEMA_OF[CURRENTS_TOPIC],
+    EVENTS_TOPIC: SCHEMA_OF[EVENTS_TOPIC],
+    URDF_TOPIC: SCHEMA_OF[URDF_TOPIC],
     PREDICTED_TOPIC: CURRENTS_SCHEMA,
     RESIDUAL_TOPIC: CURRENTS_SCHEMA,
 }
@@ -56,23 +60,31 @@ class FoxgloveStream:
         Raises:
             RuntimeError: the port is taken.
         """
-        self._live, self._context = live, foxglove.Context()
+        self._live = live
+        self._context = foxglove.Context()
         self._prefix = joint_state_prefix(joint_names(live.cell))
         self._unit = np.array([axis.unit.si for axis in live.cell.axes])
         self._before: tuple[float, FloatArray] | None = None  # time and position of the last point
         # Without capabilities a client can neither publish nor set anything.
         self._server = foxglove.start_server(
-            name=f"drivegain {live.cell.name}", host="127.0.0.1", port=port, capabilities=[], context=self._context
+            name=f"drivegain {live.cell.name}",
+            host="127.0.0.1",
+            port=port,
+            capabilities=[],
+            context=self._context,
         )
-        self._channels = {
-            topic: foxglove.Channel(
-                topic,
-                message_encoding="cdr",
-                schema=foxglove.Schema(name=schema, encoding="ros2msg", data=DEFINITIONS[schema].encode()),
-                context=self._context,
-            )
-            for topic, schema in SCHEMAS.items()
-        }
+        self._channels = {}
+        for topic, schema in SCHEMAS.items():
+            self._channels[topic] = self._channel(topic, schema)
+
+    def _channel(self, topic: str, schema: str) -> foxglove.Channel:
+        definition = DEFINITIONS[schema].encode()
+        return foxglove.Channel(
+            topic,
+            message_encoding="cdr",
+            schema=foxglove.Schema(name=schema, encoding="ros2msg", data=definition),
+            context=self._context,
+        )
 
     @property
     def port(self) -> int:
@@ -81,7 +93,8 @@ class FoxgloveStream:
 
     async def follow(self) -> None:
         """Send what is new, for ever; the server is stopped when the task is cancelled."""
-        reader, described_s = Reader(self._live), -URDF_S
+        reader = Reader(self._live)
+        described_s = -URDF_S
         try:
             while True:
                 begun, news = reader.news()
@@ -101,15 +114,22 @@ class FoxgloveStream:
         rows: list[list[float]] | None = None,
         events: list[dict[str, Any]] | None = None,
     ) -> None:
-        axes, calibration = len(self._unit), self._live.calibration
-        gains = [] if calibration is None else [gain.value for gain in calibration.gains]
+        axes = len(self._unit)
+        calibration = self._live.calibration
+        gains = []
+        if calibration is not None:
+            gains = [gain.value for gain in calibration.gains]
         for time_s, *values in points or ():
-            position, current = np.array(values[:axes]) * self._unit, np.array(values[axes:])
-            effort = joint_effort(self._live.cell, current, gains).tolist() if len(gains) == axes else []
+            position = np.array(values[:axes]) * self._unit
+            current = np.array(values[axes:])
+            effort = []
+            if len(gains) == axes:
+                effort = joint_effort(self._live.cell, current, gains).tolist()
             velocity: list[float] = []
             if self._before is not None:
-                velocity = ((position - self._before[1]) / (time_s - self._before[0])).tolist()
-            self._before = time_s, position
+                before_s, position_before = self._before
+                velocity = ((position - position_before) / (time_s - before_s)).tolist()
+            self._before = (time_s, position)
             stamp_ns = self._stamp_ns(time_s)
             state = joint_state_bytes(self._prefix, stamp_ns, position.tolist(), velocity, effort)
             self._log(JOINTS_TOPIC, stamp_ns, state)
@@ -121,9 +141,12 @@ class FoxgloveStream:
         names = self._live.cell.axis_names
         for event in events or ():
             stamp_ns = self._stamp_ns(event["time_s"])
-            axis = None if event["axis"] is None else names.index(event["axis"])
-            found = CellEvent(stamp_ns, axis, EventKind(event["kind"]), event["code"], event["text"])
-            self._log(EVENTS_TOPIC, stamp_ns, event_bytes(found))
+            axis = None
+            if event["axis"] is not None:
+                axis = names.index(event["axis"])
+            kind = EventKind(event["kind"])
+            cell_event = CellEvent(stamp_ns, axis, kind, event["code"], event["text"])
+            self._log(EVENTS_TOPIC, stamp_ns, event_bytes(cell_event))
 
     def _stamp_ns(self, time_s: float) -> int:
         return (self._live.origin_ns or 0) + round(1e9 * time_s)

@@ -76,7 +76,9 @@ class DcfDocument(ControllerDocument):
             for entry in section.entries:
                 seen[section.title, entry.name] += 1
                 again = seen[section.title, entry.name]
-                name = entry.name if again == 1 else f"{entry.name} ({again})"
+                name = f"{entry.name} ({again})"
+                if again == 1:
+                    name = entry.name
                 values[section.title, name] = entry.value
         return values, parsed_values(self.name, self.text)
 
@@ -88,7 +90,8 @@ class DcfDocument(ControllerDocument):
     def _place(self, sections: list[DcfSection], key: str) -> _Place:
         match = _KEY.fullmatch(key)
         if match is None:
-            raise self.unfit(key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
+            remedy = f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1"
+            raise self.unfit(key, "a key that names no object", remedy)
         index = int(match[1], 16)
         subindex = int(match[2] or "0", 16)
         compact = self._compact_place(sections, key, index, subindex)
@@ -98,13 +101,15 @@ class DcfDocument(ControllerDocument):
         return _Place(section, section, _VALUE)
 
     def _compact_place(self, sections: list[DcfSection], key: str, index: int, subindex: int) -> _Place | None:
-        """Return where an element of an array in compact storage is; None where it has a section of its own."""
+        """Return where an element of an array in compact storage is; None where it has its own section."""
         titles = [section.title for section in sections]
         arrays = [section for section in sections if section.title == f"{index:04x}"]
-        if subindex == 0 or len(arrays) != 1 or f"{index:04x}sub{subindex:x}" in titles:
+        own_title = f"{index:04x}sub{subindex:x}"
+        if subindex == 0 or len(arrays) != 1 or own_title in titles:
             return None
         array = arrays[0]
-        count = self._number({entry.name: entry for entry in array.entries}, key, _COMPACT, 0)
+        entries = {entry.name: entry for entry in array.entries}
+        count = self._number(entries, key, _COMPACT, 0)
         if count == 0:
             return None
         if subindex > count:
@@ -112,60 +117,65 @@ class DcfDocument(ControllerDocument):
             raise self.unfit(key, found, CORRECT_KEY, f"a subindex from 1 to {count}")
         values = [section for section in sections if section.title == f"{array.title}value"]
         if len(values) > 1:
-            lines = " and ".join(str(section.line) for section in values)
-            raise self.unfit(key, f"[{array.title}Value] {len(values)} times, on lines {lines}", "remove all but one")
+            lines = _lines_text(values)
+            found = f"[{array.title}Value] {len(values)} times, on lines {lines}"
+            raise self.unfit(key, found, "remove all but one")
         if not values:
-            raise self.unfit(
-                key,
-                f"[{array.title}] in compact storage, without [{array.title}Value]",
-                f"give the device's DCF, or add [{array.title}Value] with the line `{subindex}=` and the current gain",
-            )
+            found = f"[{array.title}] in compact storage, without [{array.title}Value]"
+            addition = f"[{array.title}Value] with the line `{subindex}=` and the current gain"
+            raise self.unfit(key, found, f"give the device's DCF, or add {addition}")
         return _Place(array, values[0], str(subindex))
 
     def _section(
         self, sections: list[DcfSection], key: str, index: int, subindex: int, *, is_named: bool
     ) -> DcfSection:
-        found = [
-            section
-            for section in sections
-            if (title := _TITLE.fullmatch(section.title))  # 2003sub1 and 2003sub01 are one object
-            and (int(title[1], 16), int(title[2] or "0", 16)) == (index, subindex)
-        ]
+        found = [section for section in sections if _object_of(section) == (index, subindex)]
         records = [section for section in found if self._is_record(section, key)]
         if records and not is_named:
-            raise self.unfit(key, f"[{records[0].title}], an array or record", "name one of its subindices")
-        # CiA 306 gives an array or record a section of its own beside that of its subindex 0.
+            raise self._is_no_variable(records[0], key)
+        # CiA 306 gives an array or record its own section, next to that of its subindex 0.
         found = [section for section in found if section not in records]
         if len(found) > 1:
-            lines = " and ".join(str(section.line) for section in found)
+            lines = _lines_text(found)
             raise self.unfit(key, f"it {len(found)} times, on lines {lines}", "remove all but one")
         if not found:
-            subs = [s.title for s in sections if s.title.startswith(f"{index:04x}")]
-            has = f"it has {', '.join(subs[:12])}" if subs else "it does not have this index at all"
-            titles = ([f"{index:04x}"] if subindex == 0 else []) + [f"{index:04x}sub{subindex:x}"]
-            raise self.unfit(key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
+            raise self._no_section(sections, key, index, subindex)
         return found[0]
 
+    def _no_section(self, sections: list[DcfSection], key: str, index: int, subindex: int) -> ControllerUnfit:
+        titles = [section.title for section in sections]
+        subs = [title for title in titles if title.startswith(f"{index:04x}")]
+        has = "it does not have this index at all"
+        if subs:
+            has = f"it has {', '.join(subs[:12])}"
+        wanted = f"[{index:04x}sub{subindex:x}]"
+        if subindex == 0:
+            wanted = f"[{index:04x}] or {wanted}"
+        return self.unfit(key, f"no section {wanted} ({has})", CORRECT_KEY)
+
     def _is_record(self, section: DcfSection, key: str) -> bool:
-        """Whether a section is that of an array or record as a whole."""
+        """Whether a section is that of an array or record, not of one element."""
         if "sub" in section.title:
             return False
         entries = {entry.name: entry for entry in section.entries}
         return self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE
 
+    def _is_no_variable(self, section: DcfSection, key: str) -> ControllerUnfit:
+        found = f"[{section.title}], an array or record"
+        return self.unfit(key, found, "name one of its subindices")
+
     def _locate(self, sections: list[DcfSection], key: str) -> Scalar:
         place = self._place(sections, key)
         section = place.described
         entries = self._entries(section, key)
-        if not place.is_compact and self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE:
-            raise self.unfit(key, f"[{section.title}], an array or record", "name one of its subindices")
+        if not place.is_compact:
+            object_type = self._number(entries, key, _OBJECT_TYPE, _VARIABLE)
+            if object_type != _VARIABLE:
+                raise self._is_no_variable(section, key)
         entry = self._entries(place.values, key).get(place.entry)
         if entry is None and place.is_compact:
-            raise self.unfit(
-                key,
-                f"[{section.title}Value] without {place.entry}, so the device has its default",
-                f"add the line `{place.entry}=` with the current gain there",
-            )
+            found = f"[{section.title}Value] without {place.entry}, so the device has its default"
+            raise self.unfit(key, found, f"add the line `{place.entry}=` with the current gain there")
         if entry is None:
             raise self.unfit(
                 key,
@@ -205,25 +215,39 @@ class DcfDocument(ControllerDocument):
     def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""
         bits, signed = _INTEGERS[kind]
-        lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
-        whole = IntegerStyle(bits, lowest, highest)
-        bounds = []
-        for name, given in (("lowlimit", lowest), ("highlimit", highest)):
-            entry = entries.get(name)
-            try:
-                bounds.append(given if entry is None or not entry.value else whole.read(entry.value))
-            except ValueError as error:
-                found = f"line {entry.line if entry else 0}: {entry.value if entry else '':.60} as {name}"
-                raise self.unfit(key, found, "correct the limit", "an integer, or nothing") from error
-        return IntegerStyle(bits, max(lowest, bounds[0]), min(highest, bounds[1]))
+        lowest = 0
+        highest = (1 << bits) - 1
+        if signed:
+            highest >>= 1
+            lowest = -highest - 1
+        style = IntegerStyle(bits, lowest, highest)
+        low_limit = self._limit(entries, key, "lowlimit", style)
+        if low_limit is not None:
+            lowest = max(lowest, low_limit)
+        high_limit = self._limit(entries, key, "highlimit", style)
+        if high_limit is not None:
+            highest = min(highest, high_limit)
+        return IntegerStyle(bits, lowest, highest)
+
+    def _limit(self, entries: dict[str, DcfEntry], key: str, name: str, style: IntegerStyle) -> int | None:
+        """Return a limit of the file; None where it gives none."""
+        entry = entries.get(name)
+        if entry is None or not entry.value:
+            return None
+        try:
+            return style.read(entry.value)
+        except ValueError as error:
+            found = f"line {entry.line}: {entry.value:.60} as {name}"
+            raise self.unfit(key, found, "correct the limit", "an integer, or nothing") from error
 
     def _number(self, entries: dict[str, DcfEntry], key: str, name: str, default: int) -> int:
         entry = entries.get(name)
         if entry is None or not entry.value:
             return default
         if not _CODE.fullmatch(entry.value):
+            found = f"line {entry.line}: {entry.value!r:.60}"
             expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
-            raise self.unfit(key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
+            raise self.unfit(key, found, "correct it", expected)
         return int(entry.value, 0)
 
 
@@ -272,7 +296,9 @@ def sections_of(text: str) -> list[DcfSection]:
     """Split the text into sections; comments and lines other than `name=value` are skipped."""
     sections: list[DcfSection] = []
     for number, line in enumerate(_LINE.finditer(text), start=1):
-        written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
+        written = line[1]
+        if number == 1:
+            written = written.removeprefix(_BYTE_ORDER_MARK)
         if written.lstrip().startswith(";"):
             continue
         title = _SECTION.fullmatch(written)
@@ -281,8 +307,22 @@ def sections_of(text: str) -> list[DcfSection]:
             sections.append(DcfSection(title[1].strip().lower(), number))
         elif entry is not None and sections:
             start = line.end(1) - len(written) + entry.start(2)
-            sections[-1].entries.append(DcfEntry(entry[1].lower(), entry[2], start, number))
+            parsed = DcfEntry(entry[1].lower(), entry[2], start, number)
+            sections[-1].entries.append(parsed)
     return sections
+
+
+def _object_of(section: DcfSection) -> tuple[int, int] | None:
+    """Return index and subindex of a section: 2003sub1 and 2003sub01 are one object; None where it is of no object."""
+    title = _TITLE.fullmatch(section.title)
+    if title is None:
+        return None
+    subindex = title[2] or "0"
+    return int(title[1], 16), int(subindex, 16)
+
+
+def _lines_text(sections: list[DcfSection]) -> str:
+    return " and ".join(str(section.line) for section in sections)
 
 
 def parsed_values(file: str, text: str) -> dict[KeyPath, str]:
@@ -304,15 +344,19 @@ def parsed_values(file: str, text: str) -> dict[KeyPath, str]:
     except (configparser.Error, AttributeError) as error:
         # An indented line goes on with the value above it; without a value, Python before 3.13 fails for want of one.
         no_value = isinstance(error, AttributeError)
-        why = "an indented line below a name without `=`" if no_value else " ".join(str(error).split())[:200]
+        why = "an indented line below a name without `=`"
+        if not no_value:
+            one_line = " ".join(str(error).split())
+            why = one_line[:200]
         raise ControllerUnfit(
             file,
             found=f"no DCF ({why})",
             expected="sections of name=value (CiA 306)",
             remedy="correct the file; nothing was written",
         ) from error
-    return {
-        (section.strip().lower(), name): value or ""
-        for section in parser.sections()
-        for name, value in parser.items(section)
-    }
+    values: dict[KeyPath, str] = {}
+    for section in parser.sections():
+        title = section.strip().lower()
+        for name, value in parser.items(section):
+            values[title, name] = value or ""
+    return values

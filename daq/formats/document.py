@@ -65,7 +65,9 @@ def comment_behind(rest: str, name: str, file_format: ControllerFormat | None = 
     if pattern is None:
         return ""
     found = pattern.match(rest)
-    return "" if found is None else found[1]
+    if found is None:
+        return ""
+    return found[1]
 
 
 def decode_document(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002

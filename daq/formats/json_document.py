@@ -33,7 +33,7 @@ class JsonDocument(ControllerDocument):
 
     def readings(self) -> tuple[Values, Values]:
         """Read with our scanner, and with Python's parser."""
-        return {path: token.text for path, token in self._scanned().items()}, self._loaded()
+        return self.first_reading(), self._loaded()
 
     def first_reading(self) -> Values:
         """Read with our scanner."""
@@ -42,7 +42,7 @@ class JsonDocument(ControllerDocument):
     def _scanned(self) -> dict[KeyPath, _Token]:
         """Return every value with its place, and `{}` or `[]` with the size of every object and list."""
         self._loaded()  # refuses all that is not JSON: the scanner need not
-        tokens = (_Token(found.lastgroup or "", found[0], found.start()) for found in _TOKEN.finditer(self.text))
+        tokens = _tokens(self.text)
         return dict(self._scan(tokens, (), next(tokens)))
 
     def _scan(self, tokens: Iterator[_Token], path: KeyPath, token: _Token) -> Iterator[tuple[KeyPath, _Token]]:
@@ -52,18 +52,23 @@ class JsonDocument(ControllerDocument):
             yield path, token
             return
         size = 0
+        is_object = token.text == "{"
         for inner in tokens:
             if inner.text in ("}", "]"):
                 break
             if inner.text == ",":
                 continue
-            if token.text == "{":
+            if is_object:
+                name = json.loads(inner.text)
                 next(tokens)  # the colon
-                yield from self._scan(tokens, (*path, json.loads(inner.text)), next(tokens))
+                yield from self._scan(tokens, (*path, name), next(tokens))
             else:
                 yield from self._scan(tokens, (*path, str(size)), inner)
             size += 1
-        yield (*path, "{}" if token.text == "{" else "[]"), _Token("size", str(size), token.start)
+        brackets = "[]"
+        if is_object:
+            brackets = "{}"
+        yield (*path, brackets), _Token("size", str(size), token.start)
 
     def _loaded(self) -> dict[KeyPath, str]:
         """Read the values with Python's parser; numbers stay text."""
@@ -97,20 +102,21 @@ class JsonDocument(ControllerDocument):
             return Scalar(key, float(token.text), token.text, token.start, line)
         if token is not None:
             raise self.unfit(key, f"{token.text:.60}", "write a plain number, without quotes")
-        if (*path, "{}") in tokens or (*path, "[]") in tokens:
+        if _is_container(tokens, path):
             raise self.unfit(key, "a list or mapping", "name the key of a number")
-        for length in range(len(path), 0, -1):
-            parent = path[: length - 1]
-            if (*parent, "{}") in tokens or (*parent, "[]") in tokens:
+        for depth in reversed(range(len(path))):
+            parent = path[:depth]
+            if _is_container(tokens, parent):
                 place = ".".join(parent) or "the file"
-                inside = {
-                    other[length - 1] for other in tokens if len(other) >= length and other[: length - 1] == parent
-                }
-                has = ", ".join(sorted(inside - {"{}", "[]"})[:12]) or "nothing"
-                raise self.unfit(key, f"no key {path[length - 1]!r} in {place} (it has {has})", CORRECT_KEY)
+                names = {other[depth] for other in tokens if len(other) > depth and other[:depth] == parent}
+                names -= {"{}", "[]"}
+                has = ", ".join(sorted(names)[:12]) or "nothing"
+                raise self.unfit(key, f"no key {path[depth]!r} in {place} (it has {has})", CORRECT_KEY)
             if parent in tokens:
                 break
-        raise self.unfit(key, f"no key {path[-1]!r} in {'.'.join(path[:-1]) or 'the file'}", CORRECT_KEY)
+        *parents, last = path
+        place = ".".join(parents) or "the file"
+        raise self.unfit(key, f"no key {last!r} in {place}", CORRECT_KEY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +126,16 @@ class _Token:
     kind: str
     text: str
     start: int
+
+
+def _tokens(text: str) -> Iterator[_Token]:
+    for found in _TOKEN.finditer(text):
+        yield _Token(found.lastgroup or "", found[0], found.start())
+
+
+def _is_container(tokens: dict[KeyPath, _Token], path: KeyPath) -> bool:
+    """Whether an object or a list is at a path."""
+    return (*path, "{}") in tokens or (*path, "[]") in tokens
 
 
 def json_document(content: bytes, name: str) -> JsonDocument:
@@ -137,12 +153,16 @@ def _broken_place(text: str, position: int) -> str:
     So does the place of a comma too many: the comma since 3.13, what follows it before.
     """
     before = text[:position].rstrip()
-    if text[position : position + 1] in ("}", "]") and before.endswith(","):
+    character = text[position : position + 1]
+    if character in ("}", "]") and before.endswith(","):
         position = len(before) - 1
     line = text.count("\n", 0, position) + 1
     column = position - text.rfind("\n", 0, position)
-    rest = text[position:].partition("\n")[0].strip()
-    found = f"'{rest:.40}'" if rest else "the end of the line"
+    rest_of_line, _, _ = text[position:].partition("\n")
+    rest = rest_of_line.strip()
+    found = "the end of the line"
+    if rest:
+        found = f"'{rest:.40}'"
     return f"line {line} column {column}: {found}"
 
 

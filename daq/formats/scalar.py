@@ -39,18 +39,26 @@ class IntegerStyle:
         if not _INTEGER.fullmatch(text):
             raise ValueError(text)
         value = int(text, 0)
-        if text[:2] in ("0x", "0X") and self.lowest < 0 and value >> (self.bits - 1) == 1:
-            value -= 1 << self.bits
-        if not -(1 << (self.bits - 1)) <= value < 1 << self.bits:
+        values = 1 << self.bits
+        half = values >> 1
+        is_hexadecimal = text[:2] in ("0x", "0X")
+        if is_hexadecimal and self.lowest < 0 and half <= value < values:
+            value -= values
+        if not -half <= value < values:
             raise ValueError(text)
         return value
 
     def spell(self, value: int, like: str) -> str:
         """Format an integer; in hexadecimal where `like` is, with at least as many digits and in the same case."""
-        if like[:2] not in ("0x", "0X"):
+        prefix = like[:2]
+        digits_like = like[2:]
+        if prefix not in ("0x", "0X"):
             return str(value)
-        digits = f"{value % (1 << self.bits):0{len(like) - 2}x}"
-        return like[:2] + (digits if re.search("[a-f]", like[2:]) else digits.upper())
+        unsigned = value % (1 << self.bits)
+        digits = f"{unsigned:0{len(digits_like)}x}"
+        if not re.search("[a-f]", digits_like):
+            digits = digits.upper()
+        return prefix + digits
 
 
 def spell(value: float, std: float, like: str = "") -> str:
@@ -62,24 +70,35 @@ def spell(value: float, std: float, like: str = "") -> str:
     Args:
         value: not zero [unit].
         std: standard deviation [unit].
-        like: text of the number that it replaces. Its exponent, its plus and at least as many decimals are kept, as the
+        like: text of the number that it replaces. Its exponent, its plus and at least as many decimals stay, as the
             file's readers are used to them.
     """
+    mantissa_like = like
+    mark = "e"
+    least_digits = 2
     exponent = _EXPONENT.search(like)
+    if exponent is not None:
+        mantissa_like = like.removesuffix(exponent[0])
+        mark, digits = exponent.groups()
+        least_digits = len(digits)
     magnitude = math.floor(math.log10(abs(value)))
     decimals = 4 - magnitude
     if std > 0:
         decimals = max(decimals, 2 - math.floor(math.log10(std)))
-    _, _, fraction = like.removesuffix(exponent[0] if exponent else "").partition(".")
     if exponent is None:
+        _, _, fraction = mantissa_like.partition(".")
         decimals = max(decimals, len(fraction))
     decimals = min(decimals, 16 - magnitude)
-    plus = "+" if like.startswith("+") else "-"
+    plus = "-"
+    if like.startswith("+"):
+        plus = "+"
     if exponent or magnitude < -5 or magnitude > 12:
-        mantissa, _, power = f"{value:{plus}.{max(decimals + magnitude, 1)}e}".partition("e")
-        mark, digits = exponent.groups() if exponent else ("e", "00")
-        return f"{mantissa}{mark}{power[0]}{abs(int(power)):0{len(digits)}d}"
-    return f"{value:{plus}.{max(decimals, 1)}f}"
+        decimals = max(decimals + magnitude, 1)
+        mantissa, _, power = f"{value:{plus}.{decimals}e}".partition("e")
+        sign = power[0]
+        return f"{mantissa}{mark}{sign}{abs(int(power)):0{least_digits}d}"
+    decimals = max(decimals, 1)
+    return f"{value:{plus}.{decimals}f}"
 
 
 KeyPath = tuple[str, ...]
@@ -105,7 +124,9 @@ class Scalar:
 
     def read(self, text: str) -> float:
         """Return the number that another text would mean in this place."""
-        return float(text) if self.integer is None else float(self.integer.read(text))
+        if self.integer is None:
+            return float(text)
+        return float(self.integer.read(text))
 
     def spell(self, value: float, std: float) -> str:
         """Format a number for this place: finite, not zero; σ bounds the error of rounding to an integer.
@@ -116,10 +137,12 @@ class Scalar:
         if self.integer is None:
             return spell(value, std, self.text)
         rounded = round(value)
-        if not self.integer.lowest <= rounded <= self.integer.highest:
+        lowest = self.integer.lowest
+        highest = self.integer.highest
+        if not lowest <= rounded <= highest:
             raise ControllerUnfit(
                 self.key,
-                found=f"{value:.6g} for an integer of {self.integer.lowest} to {self.integer.highest}",
+                found=f"{value:.6g} for an integer of {lowest} to {highest}",
                 expected="a gain that fits",
                 remedy="check the factor in `controller.gains` of the cell configuration; nothing was written",
             )
@@ -207,9 +230,9 @@ class ControllerDocument(ABC):
         self, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
     ) -> ControllerUnfit:
         """Make the error for a place that holds no number that can be changed on its own."""
-        return ControllerUnfit(
-            f"{self.name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written"
-        )
+        place = f"{self.name}: {key}"
+        remedy = f"{remedy}; nothing was written"
+        return ControllerUnfit(place, found=found, expected=expected, remedy=remedy)
 
     def path_of(self, key: str) -> KeyPath:
         """Return the path of a key's number among the values; here a dotted one (`drives.J1.gain`, `gains.0`).
@@ -233,7 +256,8 @@ class ControllerDocument(ABC):
         Raises:
             ControllerUnfit: as `locate`, or the new text has another change than these.
         """
-        changed = replace(self, text=_spliced(self.text, self.locate(tuple(spelling)), spelling))
+        scalars = self.locate(tuple(spelling))
+        changed = replace(self, text=_spliced(self.text, scalars, spelling))
         changed.check_against(self, spelling)
         return changed
 
@@ -245,24 +269,31 @@ class ControllerDocument(ABC):
         """
         targets = {before.path_of(key): number for key, number in spelling.items()}
         for old, new in zip(before.readings(), self.readings(), strict=True):
-            paths = [path for path in old.keys() | new.keys() if path not in targets and old.get(path) != new.get(path)]
-            paths += [path for path, number in targets.items() if self.number(new.get(path, "")) != number]
-            if paths:
+            others = (old.keys() | new.keys()) - targets.keys()
+            wrong = [path for path in others if old.get(path) != new.get(path)]
+            for path, number in targets.items():
+                written = self.number(new.get(path, ""))
+                if written != number:
+                    wrong.append(path)
+            if wrong:
+                places = sorted(".".join(path) for path in wrong)
                 raise ControllerUnfit(
                     self.name,
-                    found=f"another value at {', '.join(sorted('.'.join(path) for path in paths))}",
+                    found=f"another value at {', '.join(places)}",
                     expected="the new gains and nothing else changed",
                     remedy="nothing was written; write these gains as plain numbers in the file",
                 )
         # Comments, order and spacing are compared here alone.
-        expected = _spliced(before.text, before.locate(tuple(spelling)), spelling)
+        scalars = before.locate(tuple(spelling))
+        expected = _spliced(before.text, scalars, spelling)
         if self.text != expected:
             same = 0
             while self.text[same : same + 1] == expected[same : same + 1]:
                 same += 1
+            line = 1 + expected.count("\n", 0, same)
             raise ControllerUnfit(
                 self.name,
-                found=f"other characters on line {expected.count(chr(10), 0, same) + 1} than planned",
+                found=f"other characters on line {line} than planned",
                 expected="the new gains and nothing else changed",
                 remedy="nothing was written; take a new dry run",
             )
@@ -271,7 +302,9 @@ class ControllerDocument(ABC):
 def _spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) -> str:
     """Replace the numbers in some places, each named by its key."""
     for scalar in sorted(scalars, key=lambda s: s.start, reverse=True):
-        text = text[: scalar.start] + spelling[scalar.key] + text[scalar.end :]
+        before = text[: scalar.start]
+        behind = text[scalar.end :]
+        text = before + spelling[scalar.key] + behind
     return text
 
 

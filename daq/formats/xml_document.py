@@ -35,10 +35,10 @@ class Element:
 
 
 def parse(content: bytes, name: str) -> tuple[Element, str]:
-    """Read a whole file, without recursion however deep it is.
+    """Read a file, without recursion however deep it is.
 
     Returns:
-        an element around the root, with the comments beside it, and the encoding as declared.
+        an element around the root, with the comments next to it, and the encoding as declared.
 
     Raises:
         ControllerUnfit: it is no XML, or has a document type.
@@ -111,7 +111,8 @@ class XmlDocument(ControllerDocument):
         waiting = [around]
         while waiting:
             element = waiting.pop()
-            values |= {(element.label, f"@{name}"): value for name, value in element.attributes.items()}
+            for name, value in element.attributes.items():
+                values[element.label, f"@{name}"] = value
             for position, (kind, text) in enumerate(element.pieces, start=1):
                 values[element.label, f"{kind}[{position}]"] = text
             waiting.extend(element.children)
@@ -121,7 +122,9 @@ class XmlDocument(ControllerDocument):
         """Return the path of an element's text, or of an attribute."""
         around, _ = parse(self.content, self.name)
         element, attribute = self._find(around, key)
-        return (element.label, f"{TEXT}[1]" if attribute is None else f"@{attribute}")
+        if attribute is None:
+            return (element.label, f"{TEXT}[1]")
+        return (element.label, f"@{attribute}")
 
     def number(self, value: str) -> str:
         """Return a number without the blanks around it."""
@@ -140,7 +143,8 @@ class XmlDocument(ControllerDocument):
         else:
             start = self.text.index(">", at) + 1
             # An empty element <Gain/> ends where it begins.
-            end = max(start, len(content[: element.end].decode(self.encoding)))
+            closing_tag = len(content[: element.end].decode(self.encoding))
+            end = max(start, closing_tag)
             written = self.text[start:end]
         number = written.strip(_SPACE)
         if not DECIMAL.fullmatch(number):
@@ -150,7 +154,8 @@ class XmlDocument(ControllerDocument):
                 "write a plain decimal number there, without entities, CDATA, comments or other elements beside it",
             )
         start += written.index(number)
-        return Scalar(key, float(number), number, start, self.text.count("\n", 0, start) + 1)
+        line = self.text.count("\n", 0, start) + 1
+        return Scalar(key, float(number), number, start, line)
 
     def _find(self, around: Element, key: str) -> tuple[Element, str | None]:
         """Return the element that a path names, and its attribute where it names one."""
@@ -158,32 +163,37 @@ class XmlDocument(ControllerDocument):
         element = around
         walked = ""
         for step in steps:
-            found = [one for one in element.children if one.name == step.name and step.having <= one.attributes.items()]
-            found = found if step.number is None else found[step.number - 1 : step.number]
+            found = [child for child in element.children if step.matches(child)]
+            if step.number is not None:
+                found = found[step.number - 1 : step.number]
             place = walked or "the file"
             if not found:
-                has = ", ".join(dict.fromkeys(one.name for one in element.children)) or "no elements"
-                raise self.unfit(key, f"no {step.written} in {place} (it has {has:.200})", CORRECT_KEY)
+                names = dict.fromkeys(child.name for child in element.children)
+                has = ", ".join(names) or "no elements"
+                text = f"no {step.written} in {place} (it has {has:.200})"
+                raise self.unfit(key, text, CORRECT_KEY)
             if len(found) > 1:
                 lines = ", ".join(str(one.line) for one in found[:12])
                 remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
-                raise self.unfit(key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
+                text = f"{len(found)} of {step.written} in {place}, on lines {lines}"
+                raise self.unfit(key, text, remedy)
             element = found[0]
             walked = f"{walked}/{step.written}".lstrip("/")
         if attribute is not None and attribute not in element.attributes:
-            has = ", ".join(f"@{name}" for name in list(element.attributes)[:12]) or "none"
-            raise self.unfit(key, f"no attribute @{attribute} in {walked} (it has {has})", CORRECT_KEY)
+            first = list(element.attributes)[:12]
+            has = ", ".join(f"@{name}" for name in first) or "none"
+            text = f"no attribute @{attribute} in {walked} (it has {has})"
+            raise self.unfit(key, text, CORRECT_KEY)
         return element, attribute
 
     def _steps(self, key: str) -> tuple[list[_Step], str | None]:
         """Split a path into its elements and its attribute."""
         steps: list[_Step] = []
-        at = 1 if key.startswith("/") else 0
+        at = 0
+        if key.startswith("/"):
+            at = 1
         while (match := _STEP.match(key, at)) is not None:
-            conditions = [(c[1], c[2] if c[2] is not None else c[3], c[4]) for c in re.finditer(_CONDITION, match[2])]
-            having = frozenset((name, value) for name, value, _ in conditions if name)
-            number = next((int(position) for name, _, position in conditions if not name), None)
-            steps.append(_Step(match[0], match[1], having, number))
+            steps.append(_step(match))
             at = match.end()
             if at == len(key):
                 return steps, None
@@ -193,11 +203,11 @@ class XmlDocument(ControllerDocument):
             if last is not None:
                 return steps, last[1]
             at += 1
-        raise self.unfit(
-            key,
-            "a path that cannot be read" + (f" from {key[at:]!r} on" if at else ""),
-            f"{CORRECT_KEY}: Robot/Axis[@name='J1']/Gain, or Robot/Axis[1]/@gain",
-        )
+        found = "a path that cannot be read"
+        if at:
+            found = f"{found} from {key[at:]!r} on"
+        remedy = f"{CORRECT_KEY}: Robot/Axis[@name='J1']/Gain, or Robot/Axis[1]/@gain"
+        raise self.unfit(key, found, remedy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +219,26 @@ class _Step:
     having: frozenset[tuple[str, str]]  #: attributes with their values
     number: int | None  #: among those, from 1; None where there must be one alone
 
+    def matches(self, element: Element) -> bool:
+        """Whether an element has the name and the attributes; its number is not compared."""
+        return element.name == self.name and self.having <= element.attributes.items()
+
+
+def _step(match: re.Match[str]) -> _Step:
+    """Read one part of a path with its conditions: attributes, or a number."""
+    having = set()
+    number = None
+    for condition in re.finditer(_CONDITION, match[2]):
+        attribute, quoted, double_quoted, position = condition.groups()
+        if attribute:
+            value = double_quoted
+            if quoted is not None:
+                value = quoted
+            having.add((attribute, value))
+        elif number is None:
+            number = int(position)
+    return _Step(match[0], match[1], frozenset(having), number)
+
 
 def xml_document(content: bytes, name: str) -> XmlDocument:
     """Parse an XML document.
@@ -218,13 +248,14 @@ def xml_document(content: bytes, name: str) -> XmlDocument:
             character.
     """
     _, encoding = parse(content, name)
-    ascii_characters = bytes(range(128))
+    ascii_bytes = bytes(range(128))
     try:
         text = content.decode(encoding)
-        kept = text.encode(encoding) == content and ascii_characters.decode(encoding).encode() == ascii_characters
+        is_lossless = text.encode(encoding) == content
+        is_ascii_based = ascii_bytes.decode(encoding).encode() == ascii_bytes
     except (UnicodeError, LookupError):
-        kept = False
-    if not kept:
+        is_lossless = False
+    if not is_lossless or not is_ascii_based:
         raise ControllerUnfit(
             name,
             found=f"bytes that are not kept when they are read and written as {encoding}",

@@ -18,7 +18,10 @@ from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
 from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, KeyPath, Scalar, Values, utf8
 
-MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**19, 15_000, 100  #: Of a file: two parsers in Python read it before and after
+#: Of a file: two parsers in Python read it before and after
+MAX_BYTES = 2**19
+MAX_VALUES = 15_000
+MAX_DEPTH = 100
 _MERGE = "<<"
 _TABS = re.compile(r"(?<=:)[ ]*\t[ \t]*|[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
 """Tabs after a key, before a comment and at the end of a line: white space in YAML 1.2 (6.1, 6.6) and to libyaml."""
@@ -41,7 +44,8 @@ class YamlDocument(ControllerDocument):
 
     def readings(self) -> tuple[Values, Values]:
         """Read as YAML 1.2 and as YAML 1.1."""
-        return _values(_composed(self.text, self.name, "1.2")), _values(_composed(self.text, self.name, "1.1"))
+        older = _composed(self.text, self.name, "1.1")
+        return self.first_reading(), _values(older)
 
     def first_reading(self) -> Values:
         """Read as YAML 1.2."""
@@ -55,40 +59,50 @@ class YamlDocument(ControllerDocument):
             walked = (*walked, step)
             # A value that another place refers to by an alias cannot be changed without changing that place too.
             if references[id(node)] > 1:
-                raise self.unfit(key, f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)", "write it out")
+                found = f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)"
+                raise self.unfit(key, found, "write it out")
         if not isinstance(node, ScalarNode):
             raise self.unfit(key, "a list or mapping", "name the key of a number")
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
         # An anchor or a tag may precede the number; an escape within quotes makes its text another than its value.
-        begins = start == node.start_mark.index or self.text[start - 1].isspace()
-        opened = self.text[start - 1 : start] == quote if quote else begins
-        if not opened or self.text[start:end] != node.value or not DECIMAL.fullmatch(node.value):
+        before = self.text[start - 1 : start]
+        begins = start == node.start_mark.index or before.isspace()
+        if quote:
+            begins = before == quote
+        is_literal = self.text[start:end] == node.value
+        if not begins or not is_literal or not DECIMAL.fullmatch(node.value):
             raise self.unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
         if OCTAL.fullmatch(node.value):
             found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
             raise self.unfit(key, found, "write it without leading zeros")
         # Anchor and tag precede the number. A new gain has a point, and is no integer even where this one is.
-        tags = [part for part in self.text[node.start_mark.index : start].split() if part.startswith("!")]
+        properties = self.text[node.start_mark.index : start].split()
+        tags = [part for part in properties if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
             raise self.unfit(key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
-        return Scalar(key, float(node.value), node.value, start, node.start_mark.line + 1)
+        line = node.start_mark.line + 1
+        return Scalar(key, float(node.value), node.value, start, line)
 
     def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
         place = ".".join(walked) or "the file"
-        if isinstance(node, SequenceNode) and step.isdecimal() and int(step) < len(node.value):
-            child: Node = node.value[int(step)]
-            return child
+        if isinstance(node, SequenceNode) and step.isdecimal():
+            position = int(step)
+            if position < len(node.value):
+                child: Node = node.value[position]
+                return child
         if not isinstance(node, MappingNode):
             raise self.unfit(key, f"no key {step!r} in {place}", CORRECT_KEY)
-        found: list[Node] = [value for name, value in node.value if isinstance(name, ScalarNode) and name.value == step]
+        named = [(name.value, value) for name, value in node.value if isinstance(name, ScalarNode)]
+        found: list[Node] = [value for name, value in named if name == step]
         if len(found) > 1:
             raise self.unfit(key, f"{step!r} {len(found)} times in {place}", "remove all but one")
         if not found:
-            names = [str(name.value) for name, _ in node.value if isinstance(name, ScalarNode)]
+            names = [str(name) for name, _ in named]
             if _MERGE in names:
-                raise self.unfit(key, f"no {step!r} of its own in {place}, which merges (<<) another", "write it out")
+                text = f"no {step!r} of its own in {place}, which merges (<<) another"
+                raise self.unfit(key, text, "write it out")
             has = ", ".join(names[:12]) or "nothing"
             raise self.unfit(key, f"no key {step!r} in {place} (it has {has})", CORRECT_KEY)
         return found[0]
@@ -112,10 +126,11 @@ def _check_size(content: bytes, name: str) -> None:
     elif _is_large(content):
         found = f"more than {MAX_VALUES} values, or lists in lists deeper than {MAX_DEPTH}"
     if found:
+        expected = f"at most {MAX_BYTES} bytes, {MAX_VALUES} values, {MAX_DEPTH} lists in lists"
         raise ControllerUnfit(
             name,
             found=f"YAML with {found}",
-            expected=f"at most {MAX_BYTES} bytes, {MAX_VALUES} values, {MAX_DEPTH} lists in lists",
+            expected=expected,
             remedy="is this the controller's file? then keep its gains in a file of their own; nothing was written",
         )
 
@@ -183,11 +198,14 @@ def _values(root: Any) -> dict[KeyPath, str]:
             values[path] = node.value
         elif type(node).__name__ == "SequenceNode":
             values[*path, "[]"] = str(len(node.value))
-            waiting.extend(((*path, str(position)), child) for position, child in enumerate(node.value))
+            for position, child in enumerate(node.value):
+                waiting.append(((*path, str(position)), child))
         else:
             values[*path, "{}"] = str(len(node.value))
             for position, (name, value) in enumerate(node.value):
-                step = name.value if isinstance(name.value, str) else f"? {position}"
+                step = f"? {position}"
+                if isinstance(name.value, str):
+                    step = name.value
                 waiting.append(((*path, step), value))
         seen.add(id(node))
     return values

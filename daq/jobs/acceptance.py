@@ -123,15 +123,16 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     """Compare predicted torques with those of the currents, by the gains before and after the write."""
     calibration = calibration_made(session)
     decision = session.state.decision
-    previous_gains = {} if decision is None else {gain.axis: gain.old for gain in decision.gains}
+    previous_gains = {}
+    if decision is not None:
+        previous_gains = {gain.axis: gain.old for gain in decision.gains}
     before = _predicted(_with_gains(calibration, previous_gains), context, session)
     after = _predicted(calibration, context, session)
-    scales = tuple(
-        ScaleOfAxis(axis=axis, old=_finite(old), new=_finite(new), std=_finite(std))
-        for axis, (old, _), (new, std) in zip(
-            context.cell.axis_names, axis_scales(before), axis_scales(after), strict=True
-        )
-    )
+    scales = []
+    rows = zip(context.cell.axis_names, axis_scales(before), axis_scales(after), strict=True)
+    for axis, (old, _), (new, std) in rows:
+        scale = ScaleOfAxis(axis=axis, old=_finite(old), new=_finite(new), std=_finite(std))
+        scales.append(scale)
     off = [one for one in scales if not _is_right(one)]
     remark = (
         f"the error of the torques is {after.error.total:.2f} % with the current gains, {before.error.total:.2f} % "
@@ -142,7 +143,7 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
         remark = f"torques by the current gains are not those that the model predicts: {listed}"
     return Acceptance(
         log_sha256=sha256_of(log_of(session, RUN)) or "",
-        scales=scales,
+        scales=tuple(scales),
         old_error_percent=_finite(before.error.total),
         new_error_percent=_finite(after.error.total),
         accepted=not off,
@@ -162,7 +163,9 @@ def _scale_text(scale: ScaleOfAxis) -> str:
     """Say by how much the torque of an axis is off."""
     if scale.new is None or scale.std is None:
         return f"{scale.axis} did not move"
-    return f"{scale.axis} {100.0 * (scale.new - 1.0):+.1f} ± {100.0 * scale.std:.1f} %"
+    percent = 100.0 * (scale.new - 1.0)
+    std_percent = 100.0 * scale.std
+    return f"{scale.axis} {percent:+.1f} ± {std_percent:.1f} %"
 
 
 def axis_scales(found: Validation) -> list[tuple[float, float]]:
@@ -176,16 +179,19 @@ def axis_scales(found: Validation) -> list[tuple[float, float]]:
         squares = np.array_split((predicted**2)[use], PIECES)
         product = np.array([part.sum() for part in products])
         square = np.array([part.sum() for part in squares])
-        whole = float(product.sum() / square.sum())
+        scale = float(product.sum() / square.sum())
         left_out = (product.sum() - product) / (square.sum() - square)
         # Jackknife: σ² = (n − 1)/n Σ (θ_i − mean)².
-        variance = (PIECES - 1) / PIECES * float(np.sum((left_out - left_out.mean()) ** 2))
-        scales.append((whole, float(np.sqrt(variance))))
+        deviation = left_out - left_out.mean()
+        variance = (PIECES - 1) / PIECES * float(np.sum(deviation**2))
+        scales.append((scale, float(np.sqrt(variance))))
     return scales
 
 
 def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
+    if math.isfinite(number):
+        return number
+    return None
 
 
 def _predicted(calibration: Calibration, context: SessionContext, session: Session) -> Validation:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.cell import Cell, WeighedPayload, model_of
+from daq.config.cell import Cell, CellAxis, WeighedPayload, model_of
 from daq.documents.session_state import Block
 from daq.errors import DataError
 from daq.log.conversion import load_run
@@ -65,7 +65,9 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
         others = [load_run(one, cell)[0] for one in earlier]
     except DataError as error:
         return BlockFacts(unreadable=f"{error.found}: {error.remedy}")
-    saturated = () if run.recording is None else run.recording.saturated_percent
+    saturated: tuple[float, ...] = ()
+    if run.recording is not None:
+        saturated = run.recording.saturated_percent
     if not others:
         return BlockFacts(saturated_percent=saturated)
     try:
@@ -76,12 +78,14 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
         return BlockFacts(saturated_percent=saturated)
     moment_kg_m = np.nan_to_num(body.values[MOMENT])
     moment_std_kg_m = np.nan_to_num(body.std[MOMENT])
+    moment_norm_kg_m = float(np.linalg.norm(moment_kg_m))
+    moment_std_norm_kg_m = float(np.linalg.norm(moment_std_kg_m))
     return BlockFacts(
         saturated_percent=saturated,
         added_kg=body.mass_kg,
         added_std_kg=body.mass_std_kg,
-        added_moment_kg_m=float(np.linalg.norm(moment_kg_m)),
-        added_moment_std_kg_m=float(np.linalg.norm(moment_std_kg_m)),
+        added_moment_kg_m=moment_norm_kg_m,
+        added_moment_std_kg_m=moment_std_norm_kg_m,
     )
 
 
@@ -257,19 +261,22 @@ def _loaded_beside_bare(
     return None
 
 
+def _nameplate_gain(axis: CellAxis) -> Gain:
+    nameplate = axis.nameplate_gain
+    return Gain(axis=axis.name, value=nameplate, std=0.0, unit=axis.gain_unit, nameplate=nameplate)
+
+
 def _with_nameplate_gains(cell: Cell) -> Calibration:
     """Return a calibration that has the nameplate gains, and nothing else."""
-    gains = tuple(
-        Gain(axis=axis.name, value=axis.nameplate_gain, std=0.0, unit=axis.gain_unit, nameplate=axis.nameplate_gain)
-        for axis in cell.axes
-    )
+    gains = tuple(map(_nameplate_gain, cell.axes))
+    relative_error_percent = RelativeError((0.0,) * len(gains), 0.0)
     return Calibration(
         cell=cell.name,
         method="none",
         gains=gains,
         parameters=(),
         effects=(),
-        relative_error_percent=RelativeError((0.0,) * len(gains), 0.0),
+        relative_error_percent=relative_error_percent,
         holdout_error_percent=None,
         condition=1.0,
         rows=0,

@@ -97,7 +97,8 @@ def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, mos
         block_s: duration of a block [s].
         most: number of blocks until the recording ends, at least one.
     """
-    wanted = (1.0 / so_far.bare + 1.0 / so_far.loaded) / variance_ratio * (1.0 + ROUNDING)
+    present = 1.0 / so_far.bare + 1.0 / so_far.loaded
+    wanted = present / variance_ratio * (1.0 + ROUNDING)
     quickest: BlocksToCome | None = None
     for bare in range(most + 1):
         if quickest is not None and block_s * bare >= _time_s(so_far, quickest, block_s):
@@ -105,19 +106,30 @@ def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, mos
         way = _with_bare(so_far, bare, wanted)
         if way is None or not 1 <= way.count <= most:
             continue
-        if quickest is None or _time_s(so_far, way, block_s) < _time_s(so_far, quickest, block_s):
+        time_s = _time_s(so_far, way, block_s)
+        if quickest is None or time_s < _time_s(so_far, quickest, block_s):
             quickest = way
     if quickest is not None:
         return quickest
+
+    def relative_variance(way: BlocksToCome) -> float:
+        bare = so_far.bare + way.bare
+        loaded = so_far.loaded + way.loaded
+        return 1.0 / bare + 1.0 / loaded
+
     all_the_time = [BlocksToCome(bare, most - bare) for bare in range(most + 1)]
-    return min(all_the_time, key=lambda way: 1.0 / (so_far.bare + way.bare) + 1.0 / (so_far.loaded + way.loaded))
+    return min(all_the_time, key=relative_variance)
 
 
 def next_role(so_far: BlocksSoFar, way: BlocksToCome) -> BlockRole:
     """Return the role of the next block: the payload stays as it is while that is of use."""
     if so_far.is_mounted:
-        return BlockRole.LOADED if way.loaded else BlockRole.BARE
-    return BlockRole.BARE if way.bare else BlockRole.LOADED
+        if way.loaded:
+            return BlockRole.LOADED
+        return BlockRole.BARE
+    if way.bare:
+        return BlockRole.BARE
+    return BlockRole.LOADED
 
 
 def _with_bare(so_far: BlocksSoFar, bare: int, wanted: float) -> BlocksToCome | None:
@@ -125,10 +137,13 @@ def _with_bare(so_far: BlocksSoFar, bare: int, wanted: float) -> BlocksToCome | 
     left = wanted - 1.0 / (so_far.bare + bare)
     if left <= 0.0:
         return None
-    return BlocksToCome(bare, max(0, math.ceil(1.0 / left - ROUNDING) - so_far.loaded))
+    loaded = math.ceil(1.0 / left - ROUNDING)
+    return BlocksToCome(bare, max(0, loaded - so_far.loaded))
 
 
 def _time_s(so_far: BlocksSoFar, way: BlocksToCome, block_s: float) -> float:
     """Time of a person for further blocks [s]."""
-    others = way.bare if so_far.is_mounted else way.loaded
+    others = way.loaded
+    if so_far.is_mounted:
+        others = way.bare
     return block_s * way.count + (CHANGE_S if others else 0.0)

@@ -87,7 +87,9 @@ def _name_next_step(cell_file: Path, folder: Path, error: BaseException) -> None
 
 def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
     """Return the stages of a guided session: as a job, but for rehearsal and acceptance."""
-    rehearsal = (Rehearse(UntilPrecise(settings)),) if settings.rehearse else ()
+    rehearsal: tuple[Stage, ...] = ()
+    if settings.rehearse:
+        rehearsal = (Rehearse(UntilPrecise(settings)),)
     return (*rehearsal, *TO_DECISION, Accept(), Certify())
 
 
@@ -125,8 +127,12 @@ def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datet
     if not found or found[-1].finished:
         return
     last = found[-1]
-    command = fit_corrected_command(context.file, last) if isinstance(last.state, GuidedState) else ""
-    refit = f". Its blocks are not lost: `{command}` fits them with the present file" if command else ""
+    command = ""
+    if isinstance(last.state, GuidedState):
+        command = fit_corrected_command(context.file, last)
+    refit = ""
+    if command:
+        refit = f". Its blocks are not lost: `{command}` fits them with the present file"
     reason = f"the cell file has changed since{refit}"
     if now - last.began > timedelta(hours=RESUME_WITHIN_H):
         reason = f"it is older than {RESUME_WITHIN_H:g} h"
@@ -177,7 +183,9 @@ def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:
     for payload in cell.payloads:
         if payload.name == name:
             return payload
-    found = "none named" if name is None else repr(name)
+    found = "none named"
+    if name is not None:
+        found = repr(name)
     if names:
         expected = f"one of {', '.join(names)}"
         remedy = "name one of them with --payload"

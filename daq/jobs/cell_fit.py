@@ -31,7 +31,7 @@ from daq.errors import (
     writing,
 )
 from daq.files import judge_target, read_regular, replace_file
-from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
+from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, at_hand, fingerprint
 from daq.workflow.fit import BOOTSTRAP_SEED, calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
 from ident.calibration import Gain
@@ -100,9 +100,10 @@ def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> FleetFit | Failur
                 paths[at_hand(seen.log, Path(folder))] = seen.log
             logs = list(paths)
             is_searched = loop is Loop.CLOSED
+            fit_count = len(cell.fit)
             fitted = fit(
-                logs[: len(cell.fit)],
-                holdout=logs[len(cell.fit) :],
+                logs[:fit_count],
+                holdout=logs[fit_count:],
                 keep_rows=is_searched,
                 judge_holdout=not is_searched,
             )
@@ -130,12 +131,15 @@ def fit_cell(cell: CellLogs, loop: Loop, created: datetime) -> FleetFit | Failur
         except (DaqError, DriverError, IdentificationError) as error:
             return replace(failure_of(error, paths), seconds=time.perf_counter() - begun_s)
     unseen = calibration.holdout_error_percent
+    measured = unseen or calibration.relative_error_percent
+    effects = tuple((effect.name, effect.axis) for effect in calibration.effects)
+    is_partial = any(source.partial for source in calibration.sources)
     summary = Summary(
         gains=calibration.gains,
-        effects=tuple((effect.name, effect.axis) for effect in calibration.effects),
-        error_percent=(unseen or calibration.relative_error_percent).total,
+        effects=effects,
+        error_percent=measured.total,
         held_out=unseen is not None,
-        partial=any(source.partial for source in calibration.sources),
+        partial=is_partial,
     )
     return FleetFit(summary, content, time.perf_counter() - begun_s)
 
@@ -188,12 +192,14 @@ class CalibrationCache:
                 return None
             found = _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            return None  # unreadable: made anew
+            return None  # unreadable: made again
         summary, seconds = found
         numbers = [summary.error_percent, seconds]
         for gain in summary.gains:
             numbers += (gain.value, gain.std, gain.nameplate)
-        return found if all(map(math.isfinite, numbers)) else None
+        if all(map(math.isfinite, numbers)):
+            return found
+        return None
 
     def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
         """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.
@@ -209,7 +215,8 @@ class CalibrationCache:
             "seconds": fitted.seconds,
             "summary": asdict(fitted.summary),
         }
-        contents = {file: fitted.content, file.with_suffix(".json"): json.dumps(state, indent=1).encode()}
+        state_file = file.with_suffix(".json")
+        contents = {file: fitted.content, state_file: json.dumps(state, indent=1).encode()}
         for path, content in contents.items():
             with writing(path):
                 replace_file(path, content)
@@ -217,13 +224,16 @@ class CalibrationCache:
 
     def _inputs(self, cell: CellLogs) -> str:
         """Digest of all that decides a calibration: software, options, configuration, logs and their roles."""
-        logs = [
-            (role, Path(seen.log.name).name, seen.fingerprint, seen.mounting)
-            for role, several in (("fit", cell.fit), ("holdout", cell.holdout))
-            for seen in several
-        ]
+        logs = [_input("fit", seen) for seen in cell.fit]
+        logs += [_input("holdout", seen) for seen in cell.holdout]
         decisive = (STATE_VERSION, software(), self.loop.value, cell.cell, cell.configuration_sha256, logs)
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
+
+
+def _input(role: str, seen: SeenLog) -> tuple[str, str, str, str | None]:
+    """Return what of a log decides a calibration."""
+    name = Path(seen.log.name).name
+    return (role, name, seen.fingerprint, seen.mounting)
 
 
 def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
@@ -245,7 +255,9 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
 def _check_replaceable(path: Path) -> None:
     """Refuse, before the work is done, what `replace_file` would refuse."""
     try:
-        found = "a folder" if judge_target(path).is_dir() else ""
+        found = ""
+        if judge_target(path).is_dir():
+            found = "a folder"
     except OSError as error:
         found = error.strerror or type(error).__name__
     if not found:

@@ -369,10 +369,11 @@ def section_of(cell: Cell) -> Recalibration:
             continue
         payload = payloads.get(run.payload)
         if payload is None:
+            expected = f"one of the cell's payloads: {', '.join(payloads) or 'there are none'}"
             raise ConfigurationInconsistent(
                 f"recalibration.runs[{index}].payload",
                 found=repr(run.payload),
-                expected=f"one of the cell's payloads: {', '.join(payloads) or 'there are none'}",
+                expected=expected,
                 remedy="correct the cell file",
             )
         if not agree(run.mass_kg, payload.mass_kg, payload.mass_tolerance_kg):

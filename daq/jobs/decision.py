@@ -60,12 +60,13 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
         Level.NOTICE, "compared with the gains in the controller", words=decision.remark, differs=differs
     )
     after = sha256(edit.after)
+    unsigned = any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals)
     target = PlannedWrite(
         file=str(edit.name),
         base_sha256=edit.base_sha256,
         after_sha256=after,
         looked_at=edit.base,
-        unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
+        unsigned=unsigned,
         in_drives=context.target.in_drives,
     )
     _write_proposal(session, proposal, after)
@@ -80,18 +81,19 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
     if not edit.has_effect or not differs:
         return session.update(outcome=Outcome.UNCHANGED)
     if proposal.refusals or not context.operator.approve(proposal, touched=touched):
+        details = {
+            "session": session.state.session,
+            "calibration_sha256": digest,
+            "sha256_before": target.base_sha256,
+            "sha256_after": after,
+        }
         record_session(
             context.target.history.audit,
             AuditAction.PROPOSED,
             at=context.tools.now(),
             who=context.who,
             subject=context.target.subject,
-            details={
-                "session": session.state.session,
-                "calibration_sha256": digest,
-                "sha256_before": target.base_sha256,
-                "sha256_after": after,
-            },
+            details=details,
         )
         context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
         return session.update(outcome=Outcome.PROPOSED)
@@ -152,22 +154,24 @@ def _apply(context: SessionContext, proposal: Proposal[Any], now: datetime) -> W
 def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
     """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`), each among all axes."""
     judged, words = judge(proposal.edit.changes, known)
-    gains = tuple(
-        JudgedGain(
+    gains = []
+    for change in proposal.edit.changes:
+        if change.axis not in judged:
+            continue
+        drift = judged[change.axis]
+        gain = JudgedGain(
             axis=change.axis,
             unit=change.unit,
             old=change.current_gain,
             new=change.new,
             old_std=known.stds[change.axis],
             new_std=change.std,
-            change_percent=_finite(judged[change.axis].percent),
-            drift_sigma=_finite(judged[change.axis].sigmas),
-            differs=judged[change.axis].significant,
+            change_percent=_finite(drift.percent),
+            drift_sigma=_finite(drift.sigmas),
+            differs=drift.significant,
         )
-        for change in proposal.edit.changes
-        if change.axis in judged
-    )
-    return Decision(gains=gains, remark=words)
+        gains.append(gain)
+    return Decision(gains=tuple(gains), remark=words)
 
 
 def _written_since(context: SessionContext, session: Session) -> bool:
@@ -177,25 +181,26 @@ def _written_since(context: SessionContext, session: Session) -> bool:
     then as it was before, and the job must not repeat the write.
     """
     entries = read_audit(context.target.history.audit)
-    begun = [
-        index
-        for index, entry in enumerate(entries)
-        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
-    ]
+    begun = 0
+    for index, entry in enumerate(entries):
+        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder):
+            begun = index
+            break
     file = context.target.subject
     ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
     # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
-    return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
+    return any(entry.action in ends and entry.subject == file for entry in entries[begun:])
 
 
 def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
     """Write the change beside the calibration, as JSON and as a diff."""
+    refusals = [FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals]
     report = ProposalReport(
         file=str(proposal.edit.name),
         base_sha256=proposal.edit.base_sha256,
         after_sha256=after_sha256,
         changes=[_proposed_gain(change) for change in proposal.edit.changes],
-        refusals=[FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals],
+        refusals=refusals,
     )
     with writing(session.folder / PROPOSAL):
         replace_file(session.folder / PROPOSAL, json_text(report).encode())
@@ -215,4 +220,6 @@ def _proposed_gain(change: GainChange) -> ProposedGain:
 
 
 def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
+    if math.isfinite(number):
+        return number
+    return None

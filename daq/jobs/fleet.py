@@ -23,7 +23,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from daq.errors import ConfigurationMissing, UsageError, WorkersLost
-from daq.jobs.cell_fit import CalibrationCache, Failure, Loop, Summary, failure_of, fit_cell
+from daq.jobs.cell_fit import CalibrationCache, Failure, FleetFit, Loop, Summary, failure_of, fit_cell
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 from daq.report.gains import with_deviation
 from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
@@ -208,23 +208,37 @@ def fit_fleet(
 
     missing = []
     for cell in cells:
-        cached = None if cache is None else cache.cached(cell)
+        cached = None
+        if cache is not None:
+            cached = cache.cached(cell)
         if cache is None or cached is None:
             missing.append(cell)
         else:
             rows.append(replace(row_of(cell, *cached), file=cache.file(cell), kept=True))
     report_progress(len(rows), len(cells), "")
-    for cell, made in each(lambda cell: pool.executor.submit(fit_cell, cell, loop, now()), missing, pool):
+
+    def submit(cell: CellLogs) -> Future[FleetFit | Failure]:
+        return pool.executor.submit(fit_cell, cell, loop, now())
+
+    for cell, made in each(submit, missing, pool):
         # An exception is a worker that was killed, or an error of ours: the other cells have nothing to do with it.
-        found = failure_of(made) if isinstance(made, BaseException) else made
+        if isinstance(made, BaseException):
+            found: FleetFit | Failure = failure_of(made)
+        else:
+            found = made
         if isinstance(found, Failure):
             rows.append(row_of(cell, found, found.seconds))
         else:
-            file = None if cache is None else cache.store(cell, found)
+            file = None
+            if cache is not None:
+                file = cache.store(cell, found)
             rows.append(replace(row_of(cell, found.summary, found.seconds), file=file))
         report_progress(len(rows), len(cells), cell.cell)
     rows.sort(key=lambda row: (row.cell, row.configuration_sha256))
-    return (*rows, *(FleetRow(log.log.name, "", (log.log.name,), (), failure_of(log.error), 0.0) for log in unknown))
+    for log in unknown:
+        name = log.log.name
+        rows.append(FleetRow(name, "", (name,), (), failure_of(log.error), 0.0))
+    return tuple(rows)
 
 
 def each(
@@ -246,7 +260,10 @@ def each(
     while running:
         done, _ = wait(running, LOOK_S, return_when=FIRST_COMPLETED)
         # A worker that died may be restarting: it is gone when it is missing twice.
-        absent = absent + 1 if not done and not pool.present() else 0
+        is_absent = not done and not pool.present()
+        absent = absent + 1
+        if not is_absent:
+            absent = 0
         if absent > 1:
             raise _gone("no workers any more")
         for future in done:
@@ -311,7 +328,9 @@ def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
         else:
             cells = _summary_cells(row.result)
             style = None
-        shown = (*cells[:3], *(cells[3:] if effects else ()), f"{row.seconds:.2f}")
+        shown = [*cells, f"{row.seconds:.2f}"]
+        if not effects:
+            shown = [*cells[:3], f"{row.seconds:.2f}"]
         table.add_row(*map(Text, (printable(row.cell), *shown)), style=style)
     yield table
     yield from map(Sentence, _remarks(rows))
@@ -323,7 +342,8 @@ def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
 def _summary_cells(summary: Summary) -> tuple[str, str, str, str]:
     """Gains, the worst of them, the error and the effects."""
     # Lines break between gains, not within one.
-    gains = ", ".join(with_deviation(gain.value, gain.std).replace(" ", "\xa0") for gain in summary.gains)
+    texts = [with_deviation(gain.value, gain.std) for gain in summary.gains]
+    gains = ", ".join(text.replace(" ", "\xa0") for text in texts)
     units = ", ".join(dict.fromkeys(gain.unit for gain in summary.gains))
     worst = f"{summary.worst.axis} {summary.worst.std_percent:.2f}"
     error = f"{summary.error_percent:.2f}" + ("" if summary.held_out else "*")
@@ -333,8 +353,10 @@ def _summary_cells(summary: Summary) -> tuple[str, str, str, str]:
 
 def _remarks(rows: Sequence[FleetRow]) -> list[str]:
     fitted = [(row, row.result) for row in rows if isinstance(row.result, Summary)]
-    kept = sum(row.kept for row, _ in fitted)
-    again = f" ({kept} of them kept from earlier, with the same logs)" if kept else ""
+    cached = sum(row.kept for row, _ in fitted)
+    again = ""
+    if cached:
+        again = f" ({cached} of them kept from earlier, with the same logs)"
     lines = [f"{len(fitted)} of {len(rows)} fitted{again}."]
     if not all(summary.held_out for _, summary in fitted):
         lines.append("* on the moves of the fit: the cell has no second run with the same payload to hold out.")
@@ -357,8 +379,12 @@ def fleet_csv(rows: Sequence[FleetRow]) -> str:
     Missing values are empty. No text is a formula to a spreadsheet.
     """
     summaries = [row.result for row in rows if isinstance(row.result, Summary)]
-    axes = list(dict.fromkeys(gain.axis for summary in summaries for gain in summary.gains))
-    of_axes = [f"{axis} {what}" for axis in axes for what in ("gain", "std", "unit")]
+    axes: dict[str, None] = {}
+    for summary in summaries:
+        axes |= dict.fromkeys(gain.axis for gain in summary.gains)
+    of_axes: list[str] = []
+    for axis in axes:
+        of_axes += (f"{axis} gain", f"{axis} std", f"{axis} unit")
     text = io.StringIO()
     headings = (*FIRST_COLUMNS, *of_axes, *LAST_COLUMNS)
     table = csv.DictWriter(text, headings, restval="", lineterminator="\n")
@@ -371,7 +397,9 @@ def fleet_csv(rows: Sequence[FleetRow]) -> str:
 def fleet_report(rows: Sequence[FleetRow]) -> FleetReport:
     """Return the cells of a fleet."""
     fitted = sum(row.fitted for row in rows)
-    return FleetReport(cells=[_fleet_cell(row) for row in rows], fitted=fitted, failed=len(rows) - fitted)
+    cells = [_fleet_cell(row) for row in rows]
+    failed = len(rows) - fitted
+    return FleetReport(cells=cells, fitted=fitted, failed=failed)
 
 
 def _line(row: FleetRow) -> dict[str, Any]:
@@ -386,7 +414,12 @@ def _line(row: FleetRow) -> dict[str, Any]:
     if isinstance(result, Failure):
         return line | {"exit_code": result.exit_code, "error_kind": result.kind, "error": result.text}
     for gain in result.gains:
-        line |= {f"{gain.axis} gain": gain.value, f"{gain.axis} std": gain.std, f"{gain.axis} unit": gain.unit}
+        line[f"{gain.axis} gain"] = gain.value
+        line[f"{gain.axis} std"] = gain.std
+        line[f"{gain.axis} unit"] = gain.unit
+    calibration = ""
+    if row.file is not None:
+        calibration = str(row.file)
     return line | {
         "worst_axis": result.worst.axis,
         "worst_std_percent": result.worst.std_percent,
@@ -395,12 +428,15 @@ def _line(row: FleetRow) -> dict[str, Any]:
         "effects": "; ".join(f"{name} {axis}" for name, axis in result.effects),
         "partial": result.partial,
         "exit_code": 0,
-        "calibration": "" if row.file is None else str(row.file),
+        "calibration": calibration,
     }
 
 
 def _fleet_cell(row: FleetRow) -> FleetCell:
     result = row.result
+    calibration = None
+    if row.file is not None:
+        calibration = spelled_bytes(str(row.file))
     about: dict[str, Any] = {
         "cell": spelled_bytes(row.cell),
         "configuration_sha256": row.configuration_sha256 or None,
@@ -409,7 +445,7 @@ def _fleet_cell(row: FleetRow) -> FleetCell:
         "holdout": list(map(spelled_bytes, row.holdout)),
         "seconds": row.seconds,
         "kept": row.kept,
-        "calibration": None if row.file is None else spelled_bytes(str(row.file)),
+        "calibration": calibration,
     }
     if isinstance(result, Failure):
         return FleetCell(
@@ -437,7 +473,9 @@ def _fleet_cell(row: FleetRow) -> FleetCell:
 
 
 def _measured_on(summary: Summary) -> Literal["holdout", "fit"]:
-    return "holdout" if summary.held_out else "fit"
+    if summary.held_out:
+        return "holdout"
+    return "fit"
 
 
 def _fleet_gain(gain: Gain) -> FleetGain:

@@ -53,11 +53,8 @@ def list_logs(place: str) -> tuple[StoredLog, ...]:
                 logs = _listed_local(Path(root))  # file://: with links, pipes and devices, which fsspec does not report
             else:
                 below = root.rstrip("/") + "/"
-                logs = [
-                    StoredLog(store.unstrip_protocol(path), path.removeprefix(below))
-                    for path in store.find(root)
-                    if path.endswith(ENDING)
-                ]
+                paths = [path for path in store.find(root) if path.endswith(ENDING)]
+                logs = [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in paths]
     else:
         logs = _listed_local(Path(place))
     if not logs:
@@ -103,8 +100,9 @@ def _listed_local(folder: Path) -> list[StoredLog]:
         raise LogMissing(
             str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
         )
-    # Absolute: a worker may run elsewhere. Entries that are no files are kept: one may be in place of a cell's log.
-    return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
+    # Absolute: a worker may run elsewhere. Entries that are no files stay: one may be in place of a cell's log.
+    paths = folder.rglob(f"*{ENDING}")
+    return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in paths]
 
 
 def _regular(path: Path) -> Path:
@@ -113,7 +111,9 @@ def _regular(path: Path) -> Path:
         found = f"a link to {path.readlink()}, which leads nowhere"
         remedy = "mount or copy what it leads to, or move the link away"
     elif not stat.S_ISREG(mode := path.stat().st_mode):
-        found = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
+        found = "something that is no regular file"
+        if stat.S_ISDIR(mode):
+            found = "a folder"
         remedy = f"put the log there, or give this a name without {ENDING}"
     else:
         return path
@@ -148,9 +148,10 @@ def _name_errors(address: str) -> Iterator[None]:
     except DaqError:
         raise
     except Exception as error:  # every store has errors of its own, and few of them are an OSError
+        found = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise LogMissing(
             address,
-            found=(getattr(error, "strerror", None) or str(error) or type(error).__name__).lower(),
+            found=found.lower(),
             expected="a log that can be read",
             remedy="check the place, and the rights to read there",
         ) from error
@@ -202,7 +203,9 @@ def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
         except DaqError as error:
             found.append(UnknownLog(log, error))
             continue
-        mounting = None if head.run.payload is None else head.run.payload.mounting
+        mounting = None
+        if head.run.payload is not None:
+            mounting = head.run.payload.mounting
         found.append(SeenLog(log, mark, cell, digest, mounting, head.run.started_wall_ns))
     return tuple(found)
 
@@ -221,8 +224,11 @@ def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
     for (cell, digest), logs in sorted(groups.items()):
         mountings = [log.mounting for log in logs]
         loaded = [log for log in logs if log.mounting is not None]
-        held = loaded[-1:] if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1 else []
-        cells.append(CellLogs(cell, digest, tuple(log for log in logs if log not in held), tuple(held)))
+        holdout: list[SeenLog] = []
+        if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1:
+            holdout = loaded[-1:]
+        used = tuple(log for log in logs if log not in holdout)
+        cells.append(CellLogs(cell, digest, used, tuple(holdout)))
     return tuple(cells)
 
 
@@ -249,7 +255,7 @@ def _head(log: StoredLog) -> LogHead:
             try:
                 return _unfinished_head(copy)
             except LogUnreadable:
-                pass  # a longer head, or an older log: read the whole of it
+                pass  # a longer head, or an older log: read all of it
         path = at_hand(log, Path(folder))
         reader = LogReader(path)
         try:

@@ -57,7 +57,7 @@ from ident.planning.target import time_to_target
 
 REHEARSAL_SPEED = 0.25  #: Share of the planned speed
 MOST_DOUBLINGS = 3  #: Of the duration of blocks, where the asked one has no room for enough moves
-MAX_REPETITIONS = 3  #: Of one block, before the session is held
+MAX_REPETITIONS = 3  #: Of one block, before the session stops and waits
 CORRECTED = "corrected.yaml"  #: Calibration of the blocks of a session by a corrected cell file
 
 
@@ -107,12 +107,15 @@ class UntilPrecise:
         state = guided(session)
         _require_same_payload(state, self.settings.payload)
         recorded = {run.name for run in state.runs}
-        kept = tuple(block for block in state.blocks if block.name in recorded)
-        has_lost = state.judged_blocks > len(kept)  # a log was damaged since
+        blocks = tuple(block for block in state.blocks if block.name in recorded)
+        has_lost = state.judged_blocks > len(blocks)  # a log was damaged since
+        judged_blocks = state.judged_blocks
+        if has_lost:
+            judged_blocks = 0
         session = session.update(
-            blocks=kept,
-            judged_blocks=0 if has_lost else state.judged_blocks,
-            checked_blocks=min(state.checked_blocks, len(kept)),
+            blocks=blocks,
+            judged_blocks=judged_blocks,
+            checked_blocks=min(state.checked_blocks, len(blocks)),
             complete=False,
             repeated=(),
         )
@@ -443,10 +446,10 @@ class UntilPrecise:
             return BlockEstimate(())
         std_percent = np.array([gain.std_percent for gain in gains])
         outlook = outlook_of(fitted, experiment_of(context.cell, self.settings.payload), std_percent)
-        explained = tuple(
-            gain.model_copy(update={"cause": cause.value}) for gain, cause in zip(gains, outlook.causes, strict=True)
-        )
-        return BlockEstimate(explained, outlook)
+        explained = []
+        for gain, cause in zip(gains, outlook.causes, strict=True):
+            explained.append(gain.model_copy(update={"cause": cause.value}))
+        return BlockEstimate(tuple(explained), outlook)
 
 
 @dataclass(frozen=True, slots=True)
@@ -593,7 +596,9 @@ def next_step_after(error: BaseException, cell_file: Path, session: Session) -> 
         return "correct the wiring or the cell file; the same command then begins a new session"
     if isinstance(error, GeometryTurned):
         command = fit_corrected_command(cell_file, session)
-        refit = f"`{command}` then fits these blocks with it, and " if command else ""
+        refit = ""
+        if command:
+            refit = f"`{command}` then fits these blocks with it, and "
         return f"correct the cell file; {refit}the same command begins a new session"
     state = guided(session)
     if state.outcome in (Outcome.UNFIT, Outcome.REFUSED):
@@ -635,11 +640,14 @@ def require_same_cell(context: SessionContext, session: Session) -> None:
     found = load_cell(context.file).digest
     if found != context.cell.digest:
         command = fit_corrected_command(context.file, session)
-        refit = f". The recorded blocks are not lost: `{command}` fits them with the new content" if command else ""
+        refit = ""
+        if command:
+            refit = f". The recorded blocks are not lost: `{command}` fits them with the new content"
+        expected = f"the same cell in all blocks of a session (digest {context.cell.digest[:12]})"
         raise ConfigurationInconsistent(
             str(context.file),
             found=f"another content (digest {found[:12]}) than at the start of this command",
-            expected=f"the same cell in all blocks of a session (digest {context.cell.digest[:12]})",
+            expected=expected,
             remedy="nothing moves; put the old content back and start the same command, which goes on, or start it "
             f"with the new content, which begins a new session{refit}",
         )
@@ -699,16 +707,17 @@ def _variance_ratio(gains: Sequence[GainSoFar]) -> float:
 def gains_so_far(context: SessionContext, estimate: Estimate, target_percent: float) -> tuple[GainSoFar, ...]:
     """Return the gains of an estimate beside their target."""
     std_percent = 100.0 * np.abs(estimate.gains_std / estimate.gains)
-    return tuple(
-        GainSoFar(
+    gains = []
+    for axis, value, std in zip(context.cell.axes, estimate.gains, std_percent, strict=True):
+        gain = GainSoFar(
             axis=axis.name,
             unit=axis.gain_unit,
             value=float(value),
             std_percent=float(std),
             target_percent=target_percent,
         )
-        for axis, value, std in zip(context.cell.axes, estimate.gains, std_percent, strict=True)
-    )
+        gains.append(gain)
+    return tuple(gains)
 
 
 def guided(session: Session) -> GuidedState:
@@ -767,5 +776,8 @@ def _would_help(estimate: BlockEstimate, needed_s: float) -> tuple[str, ...]:
         if gain.is_precise:
             continue
         remedy = help_with(cause, gain.axis)
-        found.append(f"{gain.axis}: {cause.value}" + (f"; {remedy}" if remedy else ""))
+        text = f"{gain.axis}: {cause.value}"
+        if remedy:
+            text += f"; {remedy}"
+        found.append(text)
     return tuple(found)

@@ -105,18 +105,25 @@ def preview(
     with bus_lock(cell, lock_folder):
         found = sessions.begun_until(sessions.sessions(section.folder, cell.name), now)
         session = _open_session(section, cell, found, now)
-        made = () if session is None else tuple(run.name for run in verified_runs(session).state.runs)
+        made: tuple[str, ...] = ()
+        if session is not None:
+            made = tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
-            folder = next((path for path in (section.folder, *section.folder.parents) if path.is_dir()), section.folder)
+            folders = (section.folder, *section.folder.parents)
+            folder = next((path for path in folders if path.is_dir()), section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
             before_motion(replace(context, tools=there), take_over=False)
-    steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
+    steps = []
+    if left and section.warm_up_min:
+        steps = [f"warm up for {section.warm_up_min:g} min"]
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
         steps += ["identify gains and missing effects"]
     steps += ["compare with the current gains", f"write, approved by: {cell.apply.by.value}", "report"]
-    taken = "a new session" if session is None else f"session {session.state.session} continues"
+    taken = "a new session"
+    if session is not None:
+        taken = f"session {session.state.session} continues"
     return Preview(tuple(steps), taken)
 
 
@@ -144,8 +151,11 @@ def _counted(section: Recalibration, cell: Cell, now: datetime, journal: Journal
 def _not_due(section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime) -> Conclusion | None:
     """Conclude early where no calibration is due."""
     good = sessions.last_good(found)
-    left = timedelta(0) if good is None else good.began + timedelta(hours=section.every_h) - now
-    if good is None or left <= timedelta(0):
+    if good is None:
+        return None
+    due = good.began + timedelta(hours=section.every_h)
+    left = due - now
+    if left <= timedelta(0):
         return None
     if _open_session(section, cell, found, now) is not None:  # begun with --now
         return None

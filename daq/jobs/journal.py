@@ -77,9 +77,18 @@ class Journal:
             words = [in_words(name, value) for name, value in fields.items() if name not in repeated]
             details = ", ".join(filter(None, words))
             details = "".join(letter if letter.isprintable() else " " for letter in details)
-            line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
+            line = f"{at} "
+            if self.step:
+                line += f"{self.step}: "
+            line += event
+            if details:
+                line += f": {details}"
         else:
-            named = {key: value for key, value in (("session", self.session), ("step", self.step)) if value}
+            named = {}
+            if self.session:
+                named["session"] = self.session
+            if self.step:
+                named["step"] = self.step
             entry = {"time": at, "level": level.name.lower(), "event": event, **named, **fields}
             line = json.dumps(_plain(entry), ensure_ascii=False, allow_nan=False, default=str)
             if self.form is Form.JOURNAL:
@@ -112,15 +121,23 @@ def _label(name: str) -> str:
     return name.replace("_", " ")
 
 
+def _yes_or_no(value: bool) -> str:
+    if value:
+        return "yes"
+    return "no"
+
+
 def _value_in_words(value: object) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        return _yes_or_no(value)
     if isinstance(value, float):
         return f"{value:g}"
+    if isinstance(value, list | tuple) and any(value):
+        return ", ".join(map(_value_in_words, value))
     if isinstance(value, list | tuple):
-        return ", ".join(map(_value_in_words, value)) if any(value) else "none"
+        return "none"
     return str(value)
 
 

@@ -52,12 +52,18 @@ def log_of(session: Session, name: str) -> Path:
 def basis_of(cell: Cell, section: Recalibration) -> Basis:
     """Current basis of a session of this cell; a missing plan counts as another one."""
     plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
-    return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
+    digest = hashlib.sha256(" ".join(plans).encode())
+    return Basis(cell.name, cell.digest, digest.hexdigest())
+
+
+def _is_unchanged(session: Session, run: RecordedRun) -> bool:
+    """Whether the log of a run has the digest in the state."""
+    return sha256_of(log_of(session, run.name)) == run.sha256
 
 
 def verified_runs(session: Session) -> Session:
     """Drop the runs whose logs do not match the digests in the state."""
-    runs = tuple(run for run in session.state.runs if sha256_of(log_of(session, run.name)) == run.sha256)
+    runs = tuple(run for run in session.state.runs if _is_unchanged(session, run))
     return replace(session, state=session.state.with_(runs=runs))
 
 
@@ -221,11 +227,12 @@ def _record(context: SessionContext, run: NextRun, out: Path, speed: float = 1.0
         entered_kg=planned.mass_kg,
         unguarded=context.operator.unguarded,
     )
+    require_released = release_check(context.cell, context.tools.now, context.tools.run)
     return context.tools.record(
         request,
         free=context.tools.free,
         block_signals=context.block_signals,
-        require_released=release_check(context.cell, context.tools.now, context.tools.run),
+        require_released=require_released,
     )
 
 
@@ -234,24 +241,26 @@ def _set_aside(out: Path, journal: Journal) -> None:
     part = out.with_name(out.name + UNFINISHED)
     with writing(out):
         if out.exists():
-            aside = next(_free_names(out, "aside"))
-            out.rename(aside)
-            journal.say(Level.NOTICE, "set aside", log=aside.name)
+            renamed = next(_free_names(out, "aside"))
+            out.rename(renamed)
+            journal.say(Level.NOTICE, "set aside", log=renamed.name)
         if part.exists():
-            aside = next(_free_names(out, "partial"))
+            partial = next(_free_names(out, "partial"))
             try:
-                salvage(part, aside)
+                salvage(part, partial)
                 part.unlink()
             except LogUnreadable as error:
-                aside = part.rename(aside.with_name(aside.name + UNFINISHED))
+                unfinished = partial.with_name(partial.name + UNFINISHED)
+                partial = part.rename(unfinished)
                 journal.say(Level.NOTICE, "nothing to salvage", found=error.found)
-            journal.say(Level.NOTICE, "half a recording kept as partial", log=aside.name)
+            journal.say(Level.NOTICE, "half a recording kept as partial", log=partial.name)
 
 
 def _free_names(out: Path, kind: str) -> Iterator[Path]:
     for number in range(1, 1000):
         path = out.with_name(f"{out.stem}-{kind}-{number}{out.suffix}")
-        if not path.exists() and not path.with_name(path.name + UNFINISHED).exists():
+        unfinished = path.with_name(path.name + UNFINISHED)
+        if not path.exists() and not unfinished.exists():
             yield path
 
 
@@ -267,9 +276,9 @@ def fit_session(context: SessionContext, session: Session) -> Session:
     runs = context.schedule.runs(session)
     logs = [log_of(session, run.name) for run in runs if not run.holdout]
     unseen = [log_of(session, run.name) for run in runs if run.holdout]
-    context.journal.say(
-        Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen]
-    )
+    names = [log.name for log in logs]
+    unseen_names = [log.name for log in unseen]
+    context.journal.say(Level.INFO, "identifying", logs=names, holdout=unseen_names)
     try:
         fitted = context.tools.fit(logs, holdout=unseen)
         closed = context.tools.close_loop(
@@ -307,4 +316,6 @@ def calibration_of_session(session: Session) -> Calibration | None:
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
     own = {run.sha256 for run in session.state.runs}
-    return found if {source.sha256 for source in found.sources} == own else None
+    if {source.sha256 for source in found.sources} == own:
+        return found
+    return None

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
-from daq.documents.session_state import GuidedState, Outcome, SessionState
+from daq.documents.session_state import GuidedState, Outcome, RecordedRun, SessionState
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
@@ -57,7 +57,9 @@ def report_success(context: SessionContext, session: Session) -> Conclusion:
         OutputFailed, AuditUnusable: something could not be written; everything else was.
     """
     outcome = session.state.outcome or Outcome.STOPPED
-    remark = "" if session.state.decision is None else session.state.decision.remark
+    remark = ""
+    if session.state.decision is not None:
+        remark = session.state.decision.remark
     code = ExitCode.OK
     if outcome is Outcome.PROPOSED:
         code = ExitCode.PROPOSED
@@ -72,7 +74,9 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
         session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
         interrupted = isinstance(error, KeyboardInterrupt)
         outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
-        code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
+        code = ExitCode.INTERRUPTED
+        if not interrupted:
+            code = exit_code(type(error)) or ExitCode.UNEXPECTED
         problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         remark = "; ".join((problem, *stop_notes(error)))
         next_step = ""
@@ -91,13 +95,14 @@ def audit_entry(
     Raises:
         AuditUnusable, OutputFailed: it could not be written.
     """
+    all_details = {"session": session.state.session, "cell": context.cell.name, **details}
     return record_session(
         context.target.history.audit,
         action,
         at=context.tools.now(),
         who=context.who,
         subject=str(session.folder),
-        details={"session": session.state.session, "cell": context.cell.name, **details},
+        details=all_details,
     )
 
 
@@ -115,22 +120,27 @@ def _report(context: SessionContext, ended: Conclusion, session: Session, proble
     )
     unwritten: DaqError | None = None
     try:
+        calibration_sha256 = None
+        if state.fitted is not None:
+            calibration_sha256 = state.fitted.calibration_sha256
         details: dict[str, object] = {
             "outcome": outcome.value,
             "exit_code": code,
             "problem": problem,
             "logs": {run.name: run.sha256 for run in state.runs},
-            "calibration_sha256": None if state.fitted is None else state.fitted.calibration_sha256,
+            "calibration_sha256": calibration_sha256,
         }
         entry = audit_entry(context, AuditAction.RECALIBRATION_ENDED, session, details)
-        # Kept here too: a chain does not show by itself that its last lines are missing.
+        # Stored here too: a chain does not show by itself that its last lines are missing.
         state = state.with_(audit_sha256=entry.sha256)
     except (AuditUnusable, OutputFailed) as error:
         context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
         unwritten = error
     session = Session(session.folder, state)
     conclusion = replace(ended, session=session)
-    level = Level.NOTICE if outcome.good else Level.ERROR
+    level = Level.ERROR
+    if outcome.good:
+        level = Level.NOTICE
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=code, remark=ended.remark)
     try:
         _write_summary(conclusion, session, context.file)
@@ -207,35 +217,42 @@ def _as_report(kind: type[AnyReport], conclusion: Conclusion, cell_file: Path) -
     return kind.model_validate(values, strict=False)
 
 
+def _run_text(run: RecordedRun) -> str:
+    recordings = "recordings"
+    if run.attempts == 1:
+        recordings = "recording"
+    return f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} {recordings}"
+
+
 def text(conclusion: Conclusion, cell_file: Path) -> str:
     """Write the summary as text."""
     session = conclusion.session
     # The remark of a decision is printed above its table.
     decided = session is not None and session.state.decision is not None and not session.state.problem
-    lines = [
-        f"Outcome: {conclusion.outcome.value} (exit code {conclusion.exit_code})",
-        *(() if decided or not conclusion.remark else (conclusion.remark,)),
-    ]
+    lines = [f"Outcome: {conclusion.outcome.value} (exit code {conclusion.exit_code})"]
+    if conclusion.remark and not decided:
+        lines.append(conclusion.remark)
     if session is not None:
         state = session.state
-        lines += [
-            f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt {state.attempt}.",
-            *(
-                f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
-                f"recording{'s' * (run.attempts != 1)}"
-                for run in state.runs
-            ),
-        ]
+        lines.append(f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt {state.attempt}.")
+        lines += map(_run_text, state.runs)
         if state.fitted is not None:
             lines += ["", "Residual:", *(f"  {sentence}" for sentence in state.fitted.sentences)]
         if state.decision is not None:
             lines += ["", f"Gains: {state.decision.remark}"]
             for gain in state.decision.gains:
-                change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
-                drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
+                change = ""
+                if gain.change_percent is not None:
+                    change = f", {gain.change_percent:+.2f} %"
+                drift = ""
+                if gain.drift_sigma is not None:
+                    drift = f" ({abs(gain.drift_sigma):.1f} σ)"
+                differs = ""
+                if gain.differs:
+                    differs = ": differs"
                 lines.append(
                     f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± {gain.new_std:.2g} "
-                    f"{gain.unit}{change}{drift}{': differs' if gain.differs else ''}"
+                    f"{gain.unit}{change}{drift}{differs}"
                 )
         if isinstance(state, GuidedState):
             lines += _guided_lines(state)
@@ -279,7 +296,9 @@ def _guided_lines(state: GuidedState) -> list[str]:
     if state.would_help:
         lines += ["What would help:", *(f"  {line}" for line in state.would_help)]
     if state.acceptance is not None:
-        verdict = "Accepted" if state.acceptance.accepted else "NOT ACCEPTED"
+        verdict = "NOT ACCEPTED"
+        if state.acceptance.accepted:
+            verdict = "Accepted"
         lines += ["", f"{verdict} on new moves: {state.acceptance.remark}."]
     return lines
 
@@ -318,14 +337,18 @@ def _diagnoses(conclusion: Conclusion) -> tuple[Diagnosis, ...]:
     if conclusion.session is None or not conclusion.outcome.good:
         return ()
     calibration = calibration_of_session(conclusion.session)
-    return () if calibration is None else calibration.diagnoses
+    if calibration is None:
+        return ()
+    return calibration.diagnoses
 
 
 def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
     """List the next steps of an outcome."""
     session = conclusion.session
     outcome = conclusion.outcome
-    target = None if session is None else session.state.target
+    target = None
+    if session is not None:
+        target = session.state.target
     undo = undo_command(cell_file, in_drives=target is not None and target.in_drives)
     if outcome is Outcome.APPLIED and session is not None and _is_contradicted(session.state):
         return [
@@ -346,7 +369,9 @@ def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
             f"{command} --yes --base {target.looked_at}",
         ]
     if outcome is Outcome.APPLIED and target is not None:
-        loading = [] if target.in_drives else ["let the controller load the file"]
+        loading = ["let the controller load the file"]
+        if target.in_drives:
+            loading = []
         return [*loading, f"to undo it: {undo}"]
     if conclusion.next_step:
         return [conclusion.next_step]
@@ -383,7 +408,9 @@ def write_metrics(
         OutputFailed: the file system refuses.
     """
     shown = conclusion.session
-    calibration = None if shown is None else calibration_of_session(shown)
+    calibration = None
+    if shown is not None:
+        calibration = calibration_of_session(shown)
     if calibration is None and good is not None:
         shown = good
         calibration = calibration_of_session(good)
@@ -416,7 +443,9 @@ def write_metrics(
 def file_stem(cell: str) -> str:
     """File name of a cell; with six digits of its hash where characters that distinguish two cells were lost."""
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", cell)
-    return plain if plain == cell else f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
+    if plain == cell:
+        return plain
+    return f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
 
 
 def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: str) -> None:

@@ -67,8 +67,12 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
     found: list[Session] = []
     with suppress(FileNotFoundError), _listing(folder):
         folders = [entry for entry in folder.iterdir() if _NAME.fullmatch(entry.name)]
-        read = ((entry, _read(entry / STATE)) for entry in folders)
-        found = [Session(entry, state) for entry, state in read if state is not None and cell in (None, state.cell)]
+        for entry in folders:
+            state = _read(entry / STATE)
+            if state is None:
+                continue
+            if cell is None or state.cell == cell:
+                found.append(Session(entry, state))
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
 
 
@@ -165,7 +169,8 @@ def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = 
         name = next(name for name in names if not (folder / name).exists())
         (folder / name).mkdir()
     at = now.isoformat(timespec="seconds")
-    return save(Session(folder / name, kind(session=name, began=at, attempt_began=at, **asdict(basis))))
+    state = kind(session=name, began=at, attempt_began=at, **asdict(basis))
+    return save(Session(folder / name, state))
 
 
 def save(session: Session) -> Session:
@@ -187,7 +192,9 @@ def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, w
     last = found[-1]
     young = timedelta(0) <= now - last.began <= timedelta(hours=within_h)
     its = Basis(last.state.cell, last.state.configuration_sha256, last.state.plans_sha256)
-    return last if young and its == basis else None
+    if young and its == basis:
+        return last
+    return None
 
 
 def resume(session: Session, now: datetime) -> Session:

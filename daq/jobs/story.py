@@ -56,14 +56,19 @@ def _gains(fields: Fields) -> str:
     lines = ["", f"Gains after {fields['blocks']} blocks, {fields['motion_s']:.0f} s of motion:"]
     for gain in gains:
         is_precise = gain["std_percent"] <= gain["target_percent"]
-        verdict = "✓" if is_precise else f"not yet: {gain['std_percent'] / gain['target_percent']:.1f} × the target"
+        verdict = "✓"
+        if not is_precise:
+            verdict = f"not yet: {gain['std_percent'] / gain['target_percent']:.1f} × the target"
         value = f"{gain['value']:10.4g} {gain['unit']}"
-        lines.append(f"  {gain['axis']:{width}} {value} ± {gain['std_percent']:.2f} %   {verdict}")
+        std_percent = f"{gain['std_percent']:.2f} %"
+        lines.append(f"  {gain['axis']:{width}} {value} ± {std_percent}   {verdict}")
     worst = gains[0]
     target = f"{worst['target_percent']:g} %"
     left_s = fields["left_s"]
     if left_s > 0.0:
-        why = f" ({worst['cause']})" if worst.get("cause") else ""
+        why = ""
+        if worst.get("cause"):
+            why = f" ({worst['cause']})"
         lines.append(
             f"The target is ± {target}. {worst['axis']} needs the longest{why}: about {duration(left_s)} more at this "
             "rate."
@@ -80,20 +85,25 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min"
 
 
+def _gain_text(gain: Fields) -> str:
+    return f"{gain['axis']} {gain['value']:.4g} ± {gain['std_percent']:.2f} %"
+
+
 def _quick(fields: Fields) -> str:
     """Return the quick estimate after a move in one line, the worst gain first; before there is one, what it lacks."""
     if fields["missing"]:
         return f"No gains yet: {fields['missing']}."
     gains = fields["gains"]
-    listed = ", ".join(f"{gain['axis']} {gain['value']:.4g} ± {gain['std_percent']:.2f} %" for gain in gains)
-    beside_target = f"target ± {gains[0]['target_percent']:g} %: {listed}."
+    listed = ", ".join(map(_gain_text, gains))
+    worst = gains[0]
+    with_target = f"target ± {worst['target_percent']:g} %: {listed}."
     if fields["is_held_out"]:
-        return f"Held out, not counted. Quick estimate so far, {beside_target}"
-    head = f"Quick estimate, move {fields['move']} of {fields['moves']}, {beside_target}"
+        return f"Held out, not counted. Quick estimate so far, {with_target}"
+    head = f"Quick estimate, move {fields['move']} of {fields['moves']}, {with_target}"
     left_s = fields["left_s"]
     if left_s <= 0.0:
         return f"{head} All at the target; the end of the block decides."
-    return f"{head} {gains[0]['axis']} is worst ({fields['why']}): about {duration(left_s)} left."
+    return f"{head} {worst['axis']} is worst ({fields['why']}): about {duration(left_s)} left."
 
 
 def _time_is_up(fields: Fields) -> str:
@@ -105,17 +115,23 @@ def _time_is_up(fields: Fields) -> str:
 
 def _recorded(fields: Fields) -> str:
     lost = fields["lost_cycles"]
-    return f"{lost} of {fields['samples']} samples lost." if lost else ""
+    if lost:
+        return f"{lost} of {fields['samples']} samples lost."
+    return ""
 
 
 def _found(fields: Fields) -> str:
     """Return a sentence of what was found; the page has those of the details."""
-    return f"  {fields['text']}" if fields["in_short"] else ""
+    if fields["in_short"]:
+        return f"  {fields['text']}"
+    return ""
 
 
 def _compared(fields: Fields) -> str:
     """Return how the gains compare; where they differ, the change that is shown next says it."""
-    return "" if fields["differs"] else f"\nCompared with the current gains, {fields['words']}."
+    if fields["differs"]:
+        return ""
+    return f"\nCompared with the current gains, {fields['words']}."
 
 
 def _identifying(fields: Fields) -> str:

@@ -91,7 +91,9 @@ WantedBy=timers.target
 def unit_name(cell: Cell) -> str:
     """Without its suffix; cells whose names differ in more than small letters, digits and hyphens get a digest too."""
     plain = re.sub(r"[^a-z0-9]+", "-", cell.name.lower()).strip("-")
-    digest = "" if plain == cell.name else "-" + hashlib.sha256(cell.name.encode()).hexdigest()[:6]
+    digest = ""
+    if plain != cell.name:
+        digest = "-" + hashlib.sha256(cell.name.encode()).hexdigest()[:6]
     return f"drivegain-recalibrate-{plain or 'cell'}{digest}"
 
 
@@ -115,13 +117,21 @@ def cron_line(wanted: Installation) -> str:
 
 def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str, ...]:
     """Commands to type next."""
-    systemctl = "systemctl --user" if wanted.user else "systemctl"
-    journal = "journalctl --user" if wanted.user else "journalctl"
+    systemctl = "systemctl"
+    journal = "journalctl"
+    verify = "systemd-analyze verify"
+    if wanted.user:
+        systemctl = "systemctl --user"
+        journal = "journalctl --user"
+        verify = "systemd-analyze --user verify"
     service = timer.name.removesuffix(".timer") + ".service"
     files = shlex.join(str(folder.absolute() / name) for name in (service, timer.name))
-    link = () if folder.parts[-2:] in _SEARCHED else (f"{systemctl} link {files}",)
+    timer_file = shlex.quote(str(folder / timer.name))
+    link: tuple[str, ...] = ()
+    if folder.parts[-2:] not in _SEARCHED:
+        link = (f"{systemctl} link {files}",)
     return (
-        f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
+        f"{verify} {timer_file}",
         *link,
         f"{systemctl} daemon-reload",
         f"{systemctl} start {service}    # once, with an operator at the cell",
@@ -144,14 +154,17 @@ def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
     command = " ".join(_quoted(part) for part in _command(wanted))
     seconds = round(60 * section.max_duration_min) + 2 * STOP_S
     # The lock of the bus is in a folder that all share, so the service must see the same /tmp and /run.
-    hardening = (
-        ""
-        if wanted.user
-        else f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
-        f"CapabilityBoundingSet={_CAPABILITIES.get(wanted.owner, '')}\n"
-    )
-    owner = "" if wanted.user else f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
-    writable = "" if wanted.user else _writable(cell, section, wanted.cell_file)
+    hardening = ""
+    owner = ""
+    writable = ""
+    if not wanted.user:
+        capabilities = _CAPABILITIES.get(wanted.owner, "")
+        hardening = (
+            f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
+            f"CapabilityBoundingSet={capabilities}\n"
+        )
+        owner = f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
+        writable = _writable(cell, section, wanted.cell_file)
     return f"""{MARK}
 [Unit]
 Description=drivegain: scheduled recalibration of cell {_plain(cell.name)}
@@ -186,7 +199,12 @@ def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
         folders.add(section.metrics)
     # "-": one that is not there yet must not keep the service from starting.
     # A path is no command line: here a $ is a $.
-    return "".join(f"ReadWritePaths={_quoted('-' + str(folder), dollar='$')}\n" for folder in sorted(folders))
+    lines = []
+    for folder in sorted(folders):
+        # A folder that is missing is no error, by its "-".
+        path = _quoted(f"-{folder}", dollar="$")
+        lines.append(f"ReadWritePaths={path}\n")
+    return "".join(lines)
 
 
 def _quoted(part: str, *, dollar: str = "$$") -> str:

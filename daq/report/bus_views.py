@@ -19,6 +19,7 @@ from drivers.profiles.cia402 import ENABLED, FAULTY, State, decode
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell, CellAxis, Wired, WiredAxis
+    from daq.workflow.live_prediction import RecentCurrent
     from daq.workflow.monitor import WatchedCell
     from drivers.canopen.emcy import ErrorCode
     from drivers.canopen.node_scan import FoundNode
@@ -235,7 +236,9 @@ def scan_view(report: ScanReport) -> Iterator[RenderableType]:
     """Table of the nodes on all buses, and what needs attention."""
     yield scan_table(report.nodes)
     for node in report.nodes:
-        name = f"{printable(node.axis)} (node {node.node_id})" if node.axis else f"node {node.node_id}"
+        name = f"node {node.node_id}"
+        if node.axis:
+            name = f"{printable(node.axis)} (node {node.node_id})"
         if node.enabled:
             yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
         yield from (Text(f"{name}: {printable(remark)}", "yellow") for remark in node.remarks)
@@ -275,10 +278,18 @@ def _scanned_node(
     """Return one node; `home` is the axis that has its number, on this bus or on another."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
 
-    axis = home if home is not None and home.bus == bus else None
-    identity = None if node is None else node.identity
-    misfit = "" if axis is None else misfits.get(axis.name, "")
-    remarks = [] if node is None else list(_remarks(node, None if axis is None else axis.identity))
+    axis = None
+    if home is not None and home.bus == bus:
+        axis = home
+    identity = None
+    if node is not None:
+        identity = node.identity
+    misfit = ""
+    if axis is not None:
+        misfit = misfits.get(axis.name, "")
+    remarks = []
+    if node is not None:
+        remarks = list(_remarks(node, None if axis is None else axis.identity))
     if misfit:
         remarks.append(misfit)
     in_fault = node is not None and node.state in FAULTY
@@ -312,16 +323,30 @@ def _verdict(home: WiredAxis | None, axis: WiredAxis | None, node: FoundNode | N
     if node is None:
         return "missing"
     if axis is None:
-        return "not configured" if home is None else f"belongs on {home.bus}"
+        return _foreign_verdict(home)
     if node.shared:
         return "two devices"
     expected = axis.identity
     if expected is not None and node.identity is None:
         return "no identity"
-    if expected is not None and node.identity is not None and (differing := expected.differences(node.identity)):
-        return f"other {differing[0].partition(' 1018h')[0]}"
-    unfit = "profile incomplete" if axis.profile is None else "profile does not fit"
-    return unfit if misfit else "ok"
+    if expected is not None and node.identity is not None:
+        differing = expected.differences(node.identity)
+        if differing:
+            number, _, _ = differing[0].partition(" 1018h")
+            return f"other {number}"
+    verdict = "ok"
+    if misfit and axis.profile is None:
+        verdict = "profile incomplete"
+    elif misfit:
+        verdict = "profile does not fit"
+    return verdict
+
+
+def _foreign_verdict(home: WiredAxis | None) -> str:
+    """Return what is to be said of a node that no axis on its bus has."""
+    if home is None:
+        return "not configured"
+    return f"belongs on {home.bus}"
 
 
 OTHER_DRIVE = (
@@ -349,7 +374,9 @@ def scan_table(nodes: Sequence[ScannedNode]) -> Table:
     """Table of the nodes; first what decides whether a recording can start, then the identity."""
     headings = ("bus", "node", "axis", "power", "verdict", "state", "vendor", "product", "serial", "NMT", "name")
     # A single bus needs no column.
-    first = 0 if len({node.bus for node in nodes}) > 1 else 1
+    first = 1
+    if len({node.bus for node in nodes}) > 1:
+        first = 0
     table = plain_table(headings[first:], left=range(len(headings)), keys=3 - first)
     for node in nodes:
         cells = (
@@ -365,7 +392,9 @@ def scan_table(nodes: Sequence[ScannedNode]) -> Table:
             (node.nmt or "").lower(),
             node.device_name or "",
         )
-        style = "bold red" if node.enabled or node.verdict != "ok" else None
+        style = None
+        if node.enabled or node.verdict != "ok":
+            style = "bold red"
         table.add_row(*map(terminal_text, cells[first:]), style=style)
     return table
 
@@ -397,7 +426,9 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
     raw = axis.current_raw
     # While another master prepares, it sends no SYNC, and no axis has to answer.
     addressed = watched.reading.source.value == "asked" or watched.reading.sync_hz > 0.0
-    predicted = () if watched.prediction is None else watched.prediction.axes
+    predicted: Sequence[RecentCurrent] = ()
+    if watched.prediction is not None:
+        predicted = watched.prediction.axes
     return MonitoredAxis.of(
         axis,
         axis=declared.name,
@@ -416,7 +447,9 @@ def _monitored_axis(declared: CellAxis, watched: WatchedCell, number: int) -> Mo
 
 
 def _notice(cell: Cell, event: CellEvent) -> Notice:
-    axis = None if event.axis is None else cell.axis_names[event.axis]
+    axis = None
+    if event.axis is not None:
+        axis = cell.axis_names[event.axis]
     return Notice.of(notice_of(event.kind, event.code, axis, event.text))
 
 
@@ -467,11 +500,16 @@ def monitor_view(report: MonitorReport) -> Group:
             faults.append(Text(f"{printable(axis.axis)} {axis.remark}", "yellow"))
         if axis.in_fault:
             fault = axis.fault
-            text = _FAULT_UNKNOWN if fault is None else f"{fault.hex} {fault.text}; {fault.remedy}"
+            text = _FAULT_UNKNOWN
+            if fault is not None:
+                text = f"{fault.hex} {fault.text}; {fault.remedy}"
             faults.append(Text(f"{printable(axis.axis)} is in fault: {text}", "bold red"))
-    source = "recorder" if report.source == "overheard" and report.recorder else report.source
+    source = report.source
+    if source == "overheard" and report.recorder:
+        source = "recorder"
     head = Text(printable(f"{report.cell}: {_SOURCE_TEXT[source]}"))
-    loads = ", ".join(f"{printable(bus.bus)} {bus.load_percent:.1f} % at worst" for bus in report.buses)
+    texts = [f"{printable(bus.bus)} {bus.load_percent:.1f} % at worst" for bus in report.buses]
+    loads = ", ".join(texts)
     load = Text(f"{loads}, {report.frames_per_s:.0f} frames/s, SYNC {report.sync_hz:.1f} Hz")
     return Group(head, table, load, *prediction_view(report), *faults, *map(_notice_text, report.notices))
 
@@ -481,7 +519,9 @@ def _current_text(axis: MonitoredAxis) -> str:
         return "no power"  # the number is an old reference, or the offset of a sensor
     if axis.current_a is not None:
         return f"{axis.current_a:+.3f} A"
-    return "?" if axis.current_raw is None else f"{axis.current_raw:+d} raw"
+    if axis.current_raw is None:
+        return "?"
+    return f"{axis.current_raw:+d} raw"
 
 
 def prediction_view(report: MonitorReport) -> Iterator[RenderableType]:
@@ -507,7 +547,9 @@ def prediction_view(report: MonitorReport) -> Iterator[RenderableType]:
     if not table.row_count:
         return
     payload = report.prediction.payload
-    carried = "without payload" if payload is None else f"with payload {printable(payload)}"
+    carried = "without payload"
+    if payload is not None:
+        carried = f"with payload {printable(payload)}"
     yield Text(
         "Currents of half a second ago, in the unit of the gains' current, filtered as in the fit, "
         f"{carried}; residual of the last 10 s in which the axis moved:"
@@ -517,8 +559,12 @@ def prediction_view(report: MonitorReport) -> Iterator[RenderableType]:
 
 def _notice_text(notice: Notice) -> Text:
     """One event, with its remedy where it is alarming."""
-    where = "" if notice.axis is None else f"{notice.axis}: "
-    remedy = f"; {notice.remedy}" if notice.remedy else ""
+    where = ""
+    if notice.axis is not None:
+        where = f"{notice.axis}: "
+    remedy = ""
+    if notice.remedy:
+        remedy = f"; {notice.remedy}"
     return Text(printable(f"{where}{notice.text}{remedy}"), "yellow" if notice.alarm else "")
 
 
@@ -534,5 +580,7 @@ def current_signals(cell: Wired) -> dict[str, str]:
 def load_lines(cell: Cell) -> tuple[str, ...]:
     """Describe the load that a recording puts on each bus."""
     lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
-    says = "in lockstep; a real bus would be loaded by" if lockstep else "loaded by"
+    says = "loaded by"
+    if lockstep:
+        says = "in lockstep; a real bus would be loaded by"
     return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))

@@ -178,7 +178,9 @@ class AxisRow:
         """Verdict in words."""
         if self.refusals:
             return "; ".join(f"refused: {found_in_short(refusal)}" for refusal in self.refusals)
-        return f"differs from the {self.change.compared_with.value}" if self.significant else "same within noise"
+        if self.significant:
+            return f"differs from the {self.change.compared_with.value}"
+        return "same within noise"
 
     @property
     def significant(self) -> bool:
@@ -245,7 +247,9 @@ class Certificate:
             return Verdict.NOT_COMPARED
         if not any(row.significant for row in self.rows):
             return Verdict.UNCHANGED
-        return Verdict.WAITING if gates else Verdict.READY
+        if gates:
+            return Verdict.WAITING
+        return Verdict.READY
 
     @property
     def sentence(self) -> str:
@@ -261,9 +265,13 @@ class Certificate:
         """The verdict by gains and checks."""
         differing = [row for row in self.shown if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
-        furthest = "" if most is None else f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
+        furthest = ""
+        if most is not None:
+            furthest = f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
         total = len(self.shown)
-        count = f"all {total} gains" if len(differing) == total else f"{len(differing)} of {total} gains"
+        count = f"all {total} gains"
+        if len(differing) != total:
+            count = f"{len(differing)} of {total} gains"
         write = self.comparison.in_force
         if write is not None:
             return self._written_sentence(write, f"{count} changed by more than noise, {furthest}")
@@ -277,8 +285,10 @@ class Certificate:
                 return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
                 return f"Ready to be written: {count} change by more than noise, {furthest}. Every check passed."
-        differ = f"{count} differ from the nameplate by more than noise, {furthest}"
-        return f"Identified, not compared with a controller: {differ if differing else 'all agree with the nameplate'}."
+        compared = "all agree with the nameplate"
+        if differing:
+            compared = f"{count} differ from the nameplate by more than noise, {furthest}"
+        return f"Identified, not compared with a controller: {compared}."
 
     @property
     def contradicted(self) -> str:
@@ -299,7 +309,9 @@ class Certificate:
         if self.calibration.gains_fixed:
             return "the gains were held fixed (`--gains fixed`), so there is nothing to write"
         first, *others = self._failed
-        more = f" (and {len(others)} more, below)" if others else ""
+        more = ""
+        if others:
+            more = f" (and {len(others)} more, below)"
         return f"{first.subject}: {found_in_short(first)}, expected {first.expected}{more}"
 
     def _written_sentence(self, write: Event, changed: str) -> str:
@@ -320,7 +332,9 @@ def check_text(calibration: Calibration) -> str:
     if not calibration.diagnoses:
         return ""
     first, *others = calibration.diagnoses
-    more = f" (and {len(others)} more)" if others else ""
+    more = ""
+    if others:
+        more = f" (and {len(others)} more)"
     return f"But CHECK {first.subject}: {finding_in_short(first.found)}{more}."
 
 
@@ -366,13 +380,16 @@ def certify(
         since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
     origin = origin or Origin.of(calibration)
     before = before_write(comparison, origin.sha256)
+    changed: tuple[AxisRow, ...] = ()
+    if before is not None:
+        changed = _rows(before)
     return Certificate(
         calibration=calibration,
         comparison=comparison,
         origin=origin,
         rows=_rows(comparison),
         before=before,
-        changed=() if before is None else _rows(before),
+        changed=changed,
         earlier=earlier,
         since=since,
     )
@@ -380,24 +397,24 @@ def certify(
 
 def _rows(comparison: Comparison) -> tuple[AxisRow, ...]:
     judged, _ = judge(comparison.changes, comparison.known)
-    return tuple(
-        AxisRow(
-            change,
-            comparison.allowed_percent(change),
-            judged.get(change.axis, NOT_JUDGED),
-            tuple(refusal for refusal in comparison.refusals if refusal.subject == change.axis),
-        )
-        for change in comparison.changes
-    )
+    rows = []
+    for change in comparison.changes:
+        allowed_percent = comparison.allowed_percent(change)
+        drift = judged.get(change.axis, NOT_JUDGED)
+        refusals = tuple(refusal for refusal in comparison.refusals if refusal.subject == change.axis)
+        rows.append(AxisRow(change, allowed_percent, drift, refusals))
+    return tuple(rows)
 
 
 def _require_same(calibration: Calibration, earlier: Calibration) -> None:
-    axes, others = ({gain.axis for gain in one.gains} for one in (calibration, earlier))
+    axes = {gain.axis for gain in calibration.gains}
+    others = {gain.axis for gain in earlier.gains}
     if calibration.cell != earlier.cell or axes != others:
+        expected = f"cell {calibration.cell!r} with axes {', '.join(sorted(axes))}"
         raise CalibrationRefused(
             "--beside",
             found=f"cell {earlier.cell!r} with axes {', '.join(sorted(others))}",
-            expected=f"cell {calibration.cell!r} with axes {', '.join(sorted(axes))}",
+            expected=expected,
             remedy="give an earlier calibration of the same cell",
         )
     differences = robot_differences(earlier.robot, calibration.robot)
@@ -429,12 +446,21 @@ def _require_whole(calibration: Calibration) -> None:
 
 def certificate_report(certificate: Certificate) -> CertificateReport:
     """Return the numbers of the page."""
-    calibration, comparison = certificate.calibration, certificate.comparison
+    calibration = certificate.calibration
+    comparison = certificate.comparison
     edit = comparison.edit
     beside = None
     if certificate.earlier is not None:
         since = [_certified_gain(row) for row in certificate.since]
         beside = EarlierCalibration.of(certificate.earlier, axes=since)
+    effects = []
+    for effect in calibration.effects:
+        words = accepted_text(effect, calibration)
+        size = size_text(effect, calibration)
+        effects.append(CertifiedEffect.of(effect, effect=words, size=size))
+    controller = None
+    if edit is not None:
+        controller = str(edit.file)
     return CertificateReport.of(
         certificate,
         certificate.origin,
@@ -444,13 +470,10 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         version=1,
         status=certificate_status(comparison),
         identity=identity(calibration),
-        controller=None if edit is None else str(edit.file),
+        controller=controller,
         controller_unread=comparison.unread or None,
         axes=[_certified_gain(row) for row in certificate.rows],
-        effects=[
-            CertifiedEffect.of(one, effect=accepted_text(one, calibration), size=size_text(one, calibration))
-            for one in calibration.effects
-        ],
+        effects=effects,
         beside=beside,
     )
 
@@ -476,7 +499,9 @@ _ENDS = {WriteAction.APPLIED: "replaced by other gains", WriteAction.ROLLED_BACK
 
 def certificate_status(comparison: Comparison) -> CertificateStatus:
     """Return the status for the document of the certificate."""
-    return CertificateStatus.of(comparison.standing, state=_state(comparison).value, text=status_text(comparison))
+    state = _state(comparison)
+    text = status_text(comparison)
+    return CertificateStatus.of(comparison.standing, state=state.value, text=text)
 
 
 def _state(comparison: Comparison) -> StandingState:
@@ -494,7 +519,8 @@ def status_text(comparison: Comparison) -> str:
     if standing.write is not None:
         parts = [write_text(standing.write)]
     if standing.ended is not None:
-        parts.append(f"{_ENDS[standing.ended.action]} on {_when(standing.ended.at)} by {standing.ended.who}")
+        ended = standing.ended
+        parts.append(f"{_ENDS[ended.action]} on {_when(ended.at)} by {ended.who}")
     elif comparison.changed_by_hand:
         parts.append("the file has other gains now")
     if standing.acceptance is not None:
@@ -543,11 +569,12 @@ def identity(calibration: Calibration) -> dict[str, str]:
         # Calibrations of earlier versions do not say more.
         known = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
         payloads = f"{payloads}; {known}"
+    period = _period([one.recorded_s for one in recordings if one.recorded_s is not None])
     names = {
         "Serial numbers": _serials(calibration, recordings),
         "Operator": ", ".join(operators) or "not known: the recordings name none",
         "Payload": payloads or "none: every run was recorded without load",
-        "Recorded": _period([one.recorded_s for one in recordings if one.recorded_s is not None]),
+        "Recorded": period,
     }
     order = order_text(calibration)
     if order:
@@ -584,7 +611,9 @@ def order_text(calibration: Calibration) -> str:
     later = fmean(loaded_places) - fmean(bare_places)
     if abs(later) <= BALANCED_PLACES:
         return f"{listed}; so an even warm-up moves no gain"
-    last = "loaded" if later > 0.0 else "bare"
+    last = "bare"
+    if later > 0.0:
+        last = "loaded"
     return f"{listed}; {last} runs come later, so a warm-up moves the gains"
 
 
@@ -593,12 +622,16 @@ def payload_texts(calibration: Calibration) -> Iterator[str]:
     mounted: dict[tuple[str, float | None], list[float]] = {}
     for source in calibration.sources:
         if source.payload is not None:
-            entered = None if source.recording is None else source.recording.entered_kg
+            entered = None
+            if source.recording is not None:
+                entered = source.recording.entered_kg
             masses = mounted.setdefault((source.payload, source.mass_kg), [])
             if entered is not None and entered not in masses:
                 masses.append(entered)
     for (name, declared), masses in mounted.items():
-        entry = "no mass in the cell file" if declared is None else f"{declared:g} kg in the cell file"
+        entry = f"{declared:g} kg in the cell file"
+        if declared is None:
+            entry = "no mass in the cell file"
         scale = "not weighed a second time"
         if masses:
             scale = f"{' and '.join(f'{one:g}' for one in masses)} kg on the scale"
@@ -609,7 +642,8 @@ def _period(times_s: Sequence[float]) -> str:
     """Write the time between the first and the last recording to the minute, in UTC."""
     if not times_s:
         return "not known: the logs have no time of day"
-    first, last = (datetime.fromtimestamp(one, UTC).strftime("%Y-%m-%d %H:%M") for one in (min(times_s), max(times_s)))
+    first = f"{datetime.fromtimestamp(min(times_s), UTC):%Y-%m-%d %H:%M}"
+    last = f"{datetime.fromtimestamp(max(times_s), UTC):%Y-%m-%d %H:%M}"
     if first == last:
         return f"{first} UTC"
     same_day = first[:10] == last[:10]

@@ -133,29 +133,33 @@ def _warnings(certificate: Certificate) -> Iterator[str]:
     for one in certificate.comparison.refusals:
         if one.found in diagnosed:
             continue
-        failed.setdefault(f"found {one.found}; expected {one.expected}; {one.remedy}", []).append(one.subject)
-    if texts or failed:
-        yield html_list((*texts, *(f"{', '.join(subjects)}: {text}." for text, subjects in failed.items())))
+        text = f"found {one.found}; expected {one.expected}; {one.remedy}"
+        failed.setdefault(text, []).append(one.subject)
+    actions = list(texts)
+    for text, subjects in failed.items():
+        actions.append(f"{', '.join(subjects)}: {text}.")
+    if actions:
+        yield html_list(actions)
 
 
 def _gains(certificate: Certificate) -> str:
     compared = certificate.compared_with
-    rows = [
-        (
-            row.change.axis,
-            f"{row.change.compared_gain:.5g}",
-            f"{with_deviation(gain.value, gain.std)} {gain.unit}",
-            _percent(row.change.change_percent),
-            _limit(row.allowed_percent),
-            row.words,
-        )
-        for gain, row in zip(certificate.calibration.gains, certificate.shown, strict=True)
-    ]
+    headings = ("axis", compared, "identified ± σ", "change [%]", "limit [%]", "verdict")
+    rows = []
+    for gain, row in zip(certificate.calibration.gains, certificate.shown, strict=True):
+        change = row.change
+        compared_gain = f"{change.compared_gain:.5g}"
+        identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
+        change_text = _percent(change.change_percent)
+        limit = _limit(row.allowed_percent)
+        rows.append((change.axis, compared_gain, identified, change_text, limit, row.words))
+    note = certificate.note
+    drawings = (_changes(certificate), *_errors(certificate.calibration), _write(certificate))
     return section(
         "Drive gains",
-        table("", ("axis", compared, "identified ± σ", "change [%]", "limit [%]", "verdict"), rows, "words"),
-        paragraph(f"{certificate.note[0].upper()}{certificate.note[1:]}."),
-        pair((_changes(certificate), *_errors(certificate.calibration), _write(certificate))),
+        table("", headings, rows, "words"),
+        paragraph(f"{note[0].upper()}{note[1:]}."),
+        pair(drawings),
     )
 
 
@@ -181,29 +185,30 @@ def _changes(certificate: Certificate) -> str:
 
 def _errors(calibration: Calibration) -> Iterator[str]:
     """Error of each axis and of all, before and after; NaN where it is not known."""
-    held = calibration.holdout_error_percent
-    if held is None:
-        caption = "No run was held out: the error on data that the fit has not used is not known."
-        yield figure(
-            _beside(calibration, None, calibration.relative_error_percent),
-            f"Share of the torque that the model leaves. {caption}",
-            "Error on the data of the fit",
-        )
+    caption = "Share of the torque that the model leaves."
+    holdout = calibration.holdout_error_percent
+    if holdout is None:
+        drawing = _error_drawing(calibration, None, calibration.relative_error_percent)
+        caption = f"{caption} No run was held out: the error on data that the fit has not used is not known."
+        yield figure(drawing, caption, "Error on the data of the fit")
         return
     nameplate = calibration.nameplate_holdout_error_percent
-    hollow = "" if nameplate is None else " Hollow: the same model with the nameplate."
-    yield figure(
-        _beside(calibration, nameplate, held),
-        f"Share of the torque that the model leaves. Full: with the identified gains.{hollow}",
-        "Error on held-out runs",
-    )
+    caption = f"{caption} Full: with the identified gains."
+    if nameplate is not None:
+        caption = f"{caption} Hollow: the same model with the nameplate."
+    drawing = _error_drawing(calibration, nameplate, holdout)
+    yield figure(drawing, caption, "Error on held-out runs")
 
 
-def _beside(calibration: Calibration, before: RelativeError | None, after: RelativeError) -> str:
+def _error_drawing(calibration: Calibration, before: RelativeError | None, after: RelativeError) -> str:
     """Draw the error of each axis and of all; `before` is hollow."""
-    names = (*(gain.axis for gain in calibration.gains), "all")
-    first = (math.nan,) * len(names) if before is None else (*before.axes, before.total)
-    rows = list(zip(names, first, (*after.axes, after.total), strict=True))
+    names = [gain.axis for gain in calibration.gains]
+    names.append("all")
+    before_percent = [math.nan] * len(names)
+    if before is not None:
+        before_percent = [*before.axes, before.total]
+    after_percent = [*after.axes, after.total]
+    rows = list(zip(names, before_percent, after_percent, strict=True))
     return before_after_drawing(rows, "Error of each axis", "error [%]")
 
 
@@ -212,14 +217,18 @@ def _percent(percent: float) -> str:
     if not math.isfinite(percent):
         return "-"
     # Adding 0 turns -0.0 into 0.0.
-    return f"{percent:+.1f}" if abs(percent) >= 10.0 else f"{round(percent, 2) + 0.0:+.2f}"
+    if abs(percent) >= 10.0:
+        return f"{percent:+.1f}"
+    return f"{round(percent, 2) + 0.0:+.2f}"
 
 
 def _limit(allowed: tuple[float, float]) -> str:
     low, high = allowed
     if not math.isfinite(low) or not math.isfinite(high):
         return "-"
-    return f"±{high:.3g}" if math.isclose(-low, high) else f"{low:+.3g} to {high:+.3g}"
+    if math.isclose(-low, high):
+        return f"±{high:.3g}"
+    return f"{low:+.3g} to {high:+.3g}"
 
 
 def _effects(calibration: Calibration, consequence: str) -> str:
@@ -234,10 +243,14 @@ def _effects(calibration: Calibration, consequence: str) -> str:
 def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     before = percent_text(effect.error_before_percent)
     after = percent_text(effect.error_after_percent)
-    kept_out = any(source.role == "holdout" for source in calibration.sources)
-    data = "On data that the fit has not used" if kept_out else "On moves left out in turn, which its choice has seen"
+    has_holdout = any(source.role == "holdout" for source in calibration.sources)
+    data = "On moves left out in turn, which its choice has seen"
+    if has_holdout:
+        data = "On data that the fit has not used"
+    name = accepted_text(effect, calibration)
+    size = size_text(effect, calibration)
     text = paragraph(
-        f"{effect.axis} has {accepted_text(effect, calibration)}: {size_text(effect, calibration)}. {data}, the model "
+        f"{effect.axis} has {name}: {size}. {data}, the model "
         f"without it leaves {before} % of the torque of {effect.axis}, with it {after} %."
     )
     if effect.package is not None:
@@ -245,8 +258,12 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     shown = curve_of(effect, calibration)
     if shown is None:
         return text
-    band = "The uncertainty is not known." if shown.half_nm is None else "Band: ± 2 σ."
-    against = ", against the motion" if shown.turns else ""
+    band = "Band: ± 2 σ."
+    if shown.half_nm is None:
+        band = "The uncertainty is not known."
+    against = ""
+    if shown.turns:
+        against = ", against the motion"
     torque = f"{QUANTITY[shown.force]} [{shown.force}]{against}"
     title = f"{effect.axis}: {QUANTITY[shown.force]} that the declared model lacks"
     drawn = chart((Line(shown.x, shown.torque_nm),), title, (shown.variable, torque), half=shown.half_nm)
@@ -313,48 +330,44 @@ def _log_name(source: Source) -> str:
 
 def _since(certificate: Certificate) -> Iterator[str]:
     """Differences from an earlier calibration."""
-    earlier, calibration = certificate.earlier, certificate.calibration
+    earlier = certificate.earlier
+    calibration = certificate.calibration
     if earlier is None:
         return
     earlier_gains = {gain.axis: gain for gain in earlier.gains}
-    rows = [
-        (
-            gain.axis,
-            with_deviation(earlier_gains[gain.axis].value, earlier_gains[gain.axis].std),
-            with_deviation(gain.value, gain.std),
-            _percent(row.change.change_percent),
-            f"{abs(row.judged.sigmas):.1f}",
-            row.words,
-        )
-        for gain, row in zip(calibration.gains, certificate.since, strict=True)
-    ]
-    before, after = _effects_in_words(earlier), _effects_in_words(calibration)
+    headings = ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict")
+    rows = []
+    shifts = []
+    for gain, row in zip(calibration.gains, certificate.since, strict=True):
+        earlier_gain = earlier_gains[gain.axis]
+        earlier_text = with_deviation(earlier_gain.value, earlier_gain.std)
+        this_text = with_deviation(gain.value, gain.std)
+        change_text = _percent(row.change.change_percent)
+        sigmas = f"{abs(row.judged.sigmas):.1f}"
+        rows.append((gain.axis, earlier_text, this_text, change_text, sigmas, row.words))
+        # The limits are those of a change from the current gain, not of one from here.
+        shifts.append(replace(_interval(row), lower=-math.inf, upper=math.inf))
+    before = _effects_in_words(earlier)
+    after = _effects_in_words(calibration)
     facts = [f"New: {axis} has {words}." for axis, words in sorted(after - before)]
     facts += [f"No longer: {axis} has {words}." for axis, words in sorted(before - after)]
     now = identity(calibration)
     for name, then in identity(earlier).items():
         if now.get(name, then) != then:
             facts.append(f"{name}: {then}; now {now[name]}.")
-    change = figure(
-        # The limits are those of a change from the current gain, not of one from here.
-        intervals(
-            [replace(_interval(row), lower=-math.inf, upper=math.inf) for row in certificate.since],
-            "Change of each gain",
-            "from the earlier calibration [%]",
-        ),
-        "0 is the earlier calibration. Bar: ± 2 σ of this one.",
-        "Change from the earlier calibration",
-    )
+    drawing = intervals(shifts, "Change of each gain", "from the earlier calibration [%]")
+    caption = "0 is the earlier calibration. Bar: ± 2 σ of this one."
+    change = figure(drawing, caption, "Change from the earlier calibration")
     errors = ""
-    held = calibration.holdout_error_percent
+    holdout = calibration.holdout_error_percent
     # `certify` has refused calibrations of other axes, and errors of another number of them.
-    if earlier.holdout_error_percent is not None and held is not None:
+    if earlier.holdout_error_percent is not None and holdout is not None:
         caption = "Hollow: earlier. Full: this one. The runs differ, so that only large differences count."
-        drawn = _beside(calibration, earlier.holdout_error_percent, held)
-        errors = figure(drawn, caption, "Error on held-out runs")
+        drawing = _error_drawing(calibration, earlier.holdout_error_percent, holdout)
+        errors = figure(drawing, caption, "Error on held-out runs")
     yield section(
         "Beside the earlier calibration",
-        table("", ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict"), rows, "words"),
+        table("", headings, rows, "words"),
         pair((change, errors)),
         html_list(facts),
     )
@@ -370,14 +383,22 @@ def _rival_text(rival: str) -> str:
     return f"{WORDS.get(name, name)} {where}"
 
 
+def _filter_text(value: float | list[float]) -> str:
+    if isinstance(value, list):
+        return ", ".join(f"{one:g}" for one in value)
+    return f"{value:g}"
+
+
 def _evidence(certificate: Certificate) -> Iterator[str]:
     """Basis of the calibration: ambiguity, parameters, filters and logs."""
     calibration = certificate.calibration
-    rivals = [
-        (effect.axis, accepted_text(effect, calibration), "; ".join(map(_rival_text, effect.ambiguity)))
-        for effect in calibration.effects
-        if effect.ambiguity
-    ]
+    rivals = []
+    for effect in calibration.effects:
+        if not effect.ambiguity:
+            continue
+        name = accepted_text(effect, calibration)
+        others = "; ".join(map(_rival_text, effect.ambiguity))
+        rivals.append((effect.axis, name, others))
     if rivals:
         yield folded(
             "Effects that these data cannot distinguish",
@@ -392,7 +413,9 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
             ),
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
-    of_effects = {one.name for effect in calibration.effects for one in effect.coefficients}
+    of_effects: set[str] = set()
+    for effect in calibration.effects:
+        of_effects.update(one.name for one in effect.coefficients)
     parameters = [one for one in calibration.parameters if one.name not in of_effects]
     yield folded(
         "Dynamic parameters",
@@ -406,19 +429,23 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
     )
     filters = []
     for name, value in calibration.filter.items():
-        values = value if isinstance(value, list) else [value]
-        filters.append((_FILTERS.get(name, name.replace("_", " ")), ", ".join(f"{one:g}" for one in values)))
+        label = _FILTERS.get(name, name.replace("_", " "))
+        filters.append((label, _filter_text(value)))
     logs = [(one.name, _ROLES.get(one.role, one.role), one.sha256) for one in calibration.sources]
-    fit = calibration.relative_error_percent
+    method = _METHODS.get(calibration.method, calibration.method)
+    left = percent_text(calibration.relative_error_percent.total)
+    configuration = calibration.configuration_sha256 or "not known"
+    software = calibration.software or "software not known"
+    origin = (
+        f"Estimator {method}, {calibration.rows} rows, condition "
+        f"{calibration.condition:.0f}; on the data of the fit the model leaves {left} %. "
+        f"Calibration {certificate.origin.sha256}, configuration "
+        f"{configuration}, made {minute_text(calibration.created)} by "
+        f"{software}."
+    )
     yield folded(
         "Filters, logs and digests",
         table("Filters", ("setting", "value"), filters, "stacked"),
         table("Logs", ("log", "used for", "sha256"), logs, "names"),
-        paragraph(
-            f"Estimator {_METHODS.get(calibration.method, calibration.method)}, {calibration.rows} rows, condition "
-            f"{calibration.condition:.0f}; on the data of the fit the model leaves {percent_text(fit.total)} %. "
-            f"Calibration {certificate.origin.sha256}, configuration "
-            f"{calibration.configuration_sha256 or 'not known'}, made {minute_text(calibration.created)} by "
-            f"{calibration.software or 'software not known'}."
-        ),
+        paragraph(origin),
     )

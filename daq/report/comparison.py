@@ -78,7 +78,9 @@ class Comparison:
             return -math.inf, math.inf
         nameplate = change.nameplate_gain / compared
         bound = self.policy.max_nameplate_percent
-        ends = [100.0 * (nameplate * (1.0 + sign * bound / 100.0) - 1.0) for sign in (-1.0, 1.0)]
+        lower = nameplate * (1.0 - bound / 100.0)
+        upper = nameplate * (1.0 + bound / 100.0)
+        ends = [100.0 * (lower - 1.0), 100.0 * (upper - 1.0)]
         if self.edit is not None:
             most = self.policy.max_change_percent
             if (absolute := self.policy.max_change.get(change.axis)) is not None:
@@ -100,12 +102,12 @@ def without_controller(calibration: Calibration, unread: str, now: datetime, cel
     changes = changes_from(nameplates, GainOrigin.NAMEPLATE, calibration)
     edit = Edit(subject="", before=b"", after=b"", changes=changes)
     refusals = check_gates(GateContext(Request(calibration, now), edit, cell))
-    return Comparison(
-        changes,
-        tuple(refusal for refusal in refusals if refusal.gate not in {Gate.CHANGE, *OPERATORS}),
-        ApplyPolicy() if cell is None else cell.apply,
-        unread=unread,
-    )
+    not_judged = {Gate.CHANGE, *OPERATORS}
+    judged = tuple(refusal for refusal in refusals if refusal.gate not in not_judged)
+    policy = ApplyPolicy()
+    if cell is not None:
+        policy = cell.apply
+    return Comparison(changes, judged, policy, unread=unread)
 
 
 def changes_from(
@@ -156,11 +158,12 @@ def compare(
         unread = f"The controller was not read: {error}."
         return replace(without_controller(request.calibration, unread, request.now, cell), standing=standing)
     edit = proposal.edit
+    known = query_history(cell, edit.subject, request, edit.changes, audit)
     return Comparison(
         changes=edit.changes,
         refusals=proposal.refusals,
         policy=cell.apply,
-        known=query_history(cell, edit.subject, request, edit.changes, audit),
+        known=known,
         edit=edit,
         command=command,
         standing=standing,
@@ -172,7 +175,9 @@ def _standing(cell: Cell, request: Request, file: Path | None, audit: Path | Non
     ledger = Ledger.of(cell, audit)
     if ledger is None:
         return Standing(None, unknown="the cell has no audit log")
-    place = None if file is None else os.path.realpath(file)
+    place = None
+    if file is not None:
+        place = os.path.realpath(file)
     try:
         return read_standing(ledger, sha256(request.signed), request.now, place)
     except DaqError as error:
@@ -192,10 +197,11 @@ def before_write(comparison: Comparison, digest: str) -> Comparison | None:
     before = standing.before
     if any(change.axis not in before for change in comparison.changes):
         return None
-    changes = tuple(
-        replace(change, compared_gain=before[change.axis], compared_with=GainOrigin.PREVIOUS)
-        for change in comparison.changes
-    )
+    compared = []
+    for change in comparison.changes:
+        gain = before[change.axis]
+        compared.append(replace(change, compared_gain=gain, compared_with=GainOrigin.PREVIOUS))
+    changes = tuple(compared)
     # The previous gains were those of another calibration: none is in force for them.
     others = replace(standing.history, events=())
     known = known_of(others, "", digest, changes)

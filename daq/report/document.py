@@ -105,13 +105,15 @@ def json_tree(report: Report) -> dict[str, Any]:
 
 def json_text(report: Report) -> str:
     """Return a document as JSON with a line end; bytes of file names that are not UTF-8 are spelled out."""
-    return spelled_bytes(json.dumps(json_tree(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    tree = json_tree(report)
+    text = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False)
+    return spelled_bytes(f"{text}\n")
 
 
 def json_safe(value: Any, change: Callable[[str], str] = str) -> Any:
     """Copy a document with null for numbers that JSON lacks, and with other texts."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     if isinstance(value, str):
         return change(value)
     if isinstance(value, dict):

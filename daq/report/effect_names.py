@@ -85,7 +85,9 @@ class Curve:
     @property
     def text(self) -> str:
         """Its range in words."""
-        turns = ", against the motion in either direction" if self.turns else ""
+        turns = ""
+        if self.turns:
+            turns = ", against the motion in either direction"
         return f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} {self.force}{turns}"
 
 
@@ -95,7 +97,9 @@ def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
         return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
     words = WORDS.get(effect.name) or effect.phrase or f"the effect {effect.name!r}"
     other = other_axis(effect)
-    return words if other is None else words.replace("another joint", axes[other])
+    if other is None:
+        return words
+    return words.replace("another joint", axes[other])
 
 
 def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
@@ -118,11 +122,9 @@ def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
 def accepted_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
     """Describe an effect of a calibration, to follow "J3 has"."""
     placed = _placed(accepted, calibration)
-    return (
-        WORDS.get(accepted.name, f"the effect {accepted.name!r}")
-        if placed is None
-        else effect_text(placed.effect, calibration.places)
-    )
+    if placed is None:
+        return WORDS.get(accepted.name, f"the effect {accepted.name!r}")
+    return effect_text(placed.effect, calibration.places)
 
 
 def size_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
@@ -151,14 +153,16 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
         sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
     elif effect.settings.get("with_rotor"):
         loss, rest = found
-        # It follows its rest until this is small beside σ: where that is large, the sum may be below zero.
+        # It follows its rest until this is small against σ: where that is large, the sum may be below zero.
         inertia = max(0.0, effect.settings["rotor_inertia_kg_m2"] + rest.value / (loss.value or math.inf))
         std = rest.std / (abs(loss.value) or math.inf)
         rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
         sizes = f"{_sized(names[0], loss)}, {rotor}"
     else:
         sizes = ", ".join(_sized(name, one) for name, one in zip(names, found, strict=True))
-    return f"{sizes}, {where}" if where else sizes
+    if where:
+        return f"{sizes}, {where}"
+    return sizes
 
 
 def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None:
@@ -213,4 +217,6 @@ def _sized(name: str, one: Parameter) -> str:
 def other_axis(effect: Effect) -> int | None:
     """Index of the second axis of an effect on two axes."""
     number = effect.settings.get("other_axis", 0)
-    return int(number) - 1 if number else None
+    if number:
+        return int(number) - 1
+    return None

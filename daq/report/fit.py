@@ -168,7 +168,8 @@ def fit_view(
 ) -> Iterator[RenderableType]:
     """Gains and errors, what they rest on, and what the data cannot show; `comparison` is of all estimators."""
     fitted = found.fitted
-    axes, estimate = fitted.cell.axis_names, fitted.estimate
+    axes = fitted.cell.axis_names
+    estimate = fitted.estimate
     title = f"Drive gains of {calibration.cell} by {calibration.method}; change % is from the nameplate"
     yield gain_table(calibration.gains, title=title)
     yield from (Sentence(text, "bold") for text in warning_texts(calibration))
@@ -258,10 +259,13 @@ def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudg
     change = paper.gains - estimate.gains
     sigmas = np.abs(change) / estimate.gains_std
     percent = 100.0 * change / estimate.gains
-    far = np.flatnonzero((sigmas > TLS_APART_SIGMAS) & (np.abs(percent) > TLS_APART_PERCENT)).tolist()
+    is_certain = sigmas > TLS_APART_SIGMAS
+    is_large = np.abs(percent) > TLS_APART_PERCENT
+    far = np.flatnonzero(is_certain & is_large).tolist()
     if not far:
         return None
-    values = ", ".join(f"{axes[axis]} {paper.gains[axis]:.4g} ({percent[axis]:+.1f} %)" for axis in far)
+    texts = [f"{axes[axis]} {paper.gains[axis]:.4g} ({percent[axis]:+.1f} %)" for axis in far]
+    values = ", ".join(texts)
     return (
         f"The paper's total least squares, which is not used here, finds {values}. With noise alone the two methods "
         "agree better: an effect that the model lacks may bend these gains (`drivegain residual` looks for it)."
@@ -284,16 +288,18 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
         sometimes["torque_channel"] = own_torques(fitted.torque_slopes, calibration.gains)
     if comparison is not None:
         sometimes["comparison"] = [_trial(trial, axes) for trial in comparison.trials]
+    geometry = checked_geometry(fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses)
+    verdicts = []
+    for gain in needed_verdicts(fitted):
+        axis = axes[gain.axis]
+        verdicts.append(GainWords.of(gain, axis=axis, seen_by=gain.sources, words=gain.words(axis)))
     return with_calibration(
         FitReport,
         calibration,
         compared=compared,
-        geometry=checked_geometry(fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses),
+        geometry=geometry,
         removed=_removed(found),
-        verdicts=[
-            GainWords.of(gain, axis=axes[gain.axis], seen_by=gain.sources, words=gain.words(axes[gain.axis]))
-            for gain in needed_verdicts(fitted)
-        ],
+        verdicts=verdicts,
         **sometimes,
     )
 
@@ -311,29 +317,31 @@ def with_calibration(kind: type[BodyT], calibration: Calibration, **others: obje
 
 
 def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[ComparedGain]:
-    return [
-        ComparedGain.of(axis=axis, value=value, std_percent=100.0 * (std / abs(value)))
-        for axis, value, std in zip(axes, gains, stds, strict=True)
-    ]
+    compared = []
+    for axis, value, std in zip(axes, gains, stds, strict=True):
+        std_percent = 100.0 * (std / abs(value))
+        compared.append(ComparedGain.of(axis=axis, value=value, std_percent=std_percent))
+    return compared
 
 
 def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> CasesReport:
     """Return the paper's cases and ours; both arguments are by the name of the case."""
-    cases = {
-        case.name: with_calibration(
+    cases = {}
+    for case in CASES:
+        cases[case.name] = with_calibration(
             CaseReport,
             calibrations[case.name],
             title=case.title,
             known=case.known.value,
             removed=_removed(fits[case.name]),
         )
-        for case in CASES
-    }
     return CasesReport(cases=cases)
 
 
 def _removed(found: CaseFit) -> Sequence[Removal]:
-    return () if found.essential is None else found.essential.removed
+    if found.essential is None:
+        return ()
+    return found.essential.removed
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
@@ -367,16 +375,15 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     """Linear parameters of an effect with their σ, by their short names; empty where the model lacks the effect."""
     estimate = evidence.estimate
     index = {column.name: number for number, column in enumerate(estimate.unknowns)}
-    return tuple(
-        Parameter(
-            short.name,
-            float(estimate.parameters[index[whole.name]] + whole.about),
-            float(estimate.parameters_std[index[whole.name]]),
-            whole.unit,
-        )
-        for short, whole in zip(placed.effect.coefficients, placed.columns, strict=True)
-        if whole.name in index
-    )
+    found = []
+    for coefficient, column in zip(placed.effect.coefficients, placed.columns, strict=True):
+        if column.name not in index:
+            continue
+        number = index[column.name]
+        value = float(estimate.parameters[number] + column.about)
+        std = float(estimate.parameters_std[number])
+        found.append(Parameter(coefficient.name, value, std, column.unit))
+    return tuple(found)
 
 
 def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Iterator[str]:
@@ -402,7 +409,9 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
             f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
             "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper."
         )
-    masses = "".join(f" {text[0].upper()}{text[1:]}." for text in mass_texts(influences))
+    masses = ""
+    for text in mass_texts(influences):
+        masses += f" {text[0].upper()}{text[1:]}."
     yield f"{mistake}{masses} A gear efficiency that is the same in both directions is part of its gain."
 
 
@@ -493,7 +502,9 @@ def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) ->
             values = (f"{gain:.4g}" for gain in trial.gains)
             gains.add_row(trial.estimator, *values, f"{trial.relative_error_percent:.2f}")
         spread = comparison.spread_percent(trial.estimator)
-        shares = ["-"] * len(axes) if spread is None else [f"{share:.2f}" for share in spread]
+        shares = ["-"] * len(axes)
+        if spread is not None:
+            shares = [f"{share:.2f}" for share in spread]
         spreads.add_row(trial.estimator, *shares)
     return gains, spreads
 

@@ -47,10 +47,16 @@ def full_parameter_table(found: FullSet) -> Table:
         ("parameter", "value", "± σ", "unit", "by", "prior", "± σ"), title="Full parameters", left=(0, 3, 4)
     )
     for one in found.parameters:
-        prior = "-" if one.prior is None else f"{one.prior:.4g}"
-        prior_std = "-" if one.prior_std is None else f"{one.prior_std:.2g}"
+        prior = "-"
+        if one.prior is not None:
+            prior = f"{one.prior:.4g}"
+        prior_std = "-"
+        if one.prior_std is not None:
+            prior_std = f"{one.prior_std:.2g}"
         is_rounding = abs(one.value) < _ROUNDING * one.std
-        value = 0.0 if is_rounding else one.value
+        value = one.value
+        if is_rounding:
+            value = 0.0
         table.add_row(terminal_text(one.name), f"{value:.4g}", f"{one.std:.2g}", one.unit, one.basis, prior, prior_std)
     return table
 

@@ -57,7 +57,7 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     )
     if truth is not None:
         true = [100.0 * (truth[gain.axis] / gain.nameplate - 1.0) for gain in gains]
-        # Beside the estimate, so that neither covers the other.
+        # Next to the estimate, so that neither covers the other.
         place.plot(positions + 0.14, true, "D", color=GREEN, markersize=5, label="truth of the simulated cell")
     place.set_xticks(positions, [f"{gain.axis}\n{gain.value:.4g} {gain.unit}" for gain in gains])
     place.set_xlim(-0.6, len(gains) - 0.4)
@@ -69,18 +69,25 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
     """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
-    true = ("truth", "error %") if truth else ()
+    true: tuple[str, ...] = ()
+    if truth:
+        true = ("truth", "error %")
     headings = ("axis", "nameplate", "identified ± σ", "σ %", "change %", *true, "unit")
     table = plain_table(headings, title=title, left=(0, len(headings) - 1))
     for gain in gains:
+        std_percent = "-"
+        if gain.std:
+            std_percent = f"{gain.std_percent:.2f}"
         row = [
             f"{gain.nameplate:.4g}",
             with_deviation(gain.value, gain.std),
-            f"{gain.std_percent:.2f}" if gain.std else "-",
+            std_percent,
             f"{gain.change_percent:+.1f}",
         ]
         if truth:
-            row += [f"{truth[gain.axis]:.4g}", f"{100.0 * (gain.value / truth[gain.axis] - 1.0):+.2f}"]
+            true_gain = truth[gain.axis]
+            error_percent = 100.0 * (gain.value / true_gain - 1.0)
+            row += [f"{true_gain:.4g}", f"{error_percent:+.2f}"]
         table.add_row(terminal_text(gain.axis), *row, terminal_text(gain.unit))
     return table
 
@@ -104,11 +111,13 @@ def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) ->
 
 def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Iterator[str]:
     """Say what a slope means that differs from its gain by more than CERTAIN_SIGMAS of their ratio."""
-    far = [
-        f"{gain.axis} ({100.0 * (slope.value / gain.value - 1.0):+.1f} %)"
-        for slope, gain in zip(slopes, gains, strict=True)
-        if slope is not None and abs(slope.value / gain.value - 1.0) > CERTAIN_SIGMAS * _ratio_std(slope, gain)
-    ]
+    far = []
+    for slope, gain in zip(slopes, gains, strict=True):
+        if slope is None:
+            continue
+        difference = slope.value / gain.value - 1.0
+        if abs(difference) > CERTAIN_SIGMAS * _ratio_std(slope, gain):
+            far.append(f"{gain.axis} ({100.0 * difference:+.1f} %)")
     if far:
         yield (
             f"The drive's own torque differs from the gain by more than {CERTAIN_SIGMAS:g} σ on {', '.join(far)}: a "
@@ -125,7 +134,8 @@ def _own_torque(slope: TorqueSlope | None, gain: Gain) -> OwnTorque:
     if slope is None:
         return OwnTorque(axis=gain.axis, slope=None)
     ratio = slope.value / gain.value
-    return OwnTorque.of(slope, axis=gain.axis, slope=slope.value, ratio=ratio, ratio_std=_ratio_std(slope, gain))
+    ratio_std = _ratio_std(slope, gain)
+    return OwnTorque.of(slope, axis=gain.axis, slope=slope.value, ratio=ratio, ratio_std=ratio_std)
 
 
 def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
@@ -170,8 +180,12 @@ def encoder_text(misfit: EncoderMisfit) -> str:
             "the gains are those of the described geometry"
         )
     texts = " and ".join(map(_correction_text, misfit.corrections))
-    others = f", or by {'; or by '.join(misfit.alternatives)}" if misfit.alternatives else ""
-    used = "corrected" if misfit.applied else "described"
+    others = ""
+    if misfit.alternatives:
+        others = f", or by {'; or by '.join(misfit.alternatives)}"
+    used = "described"
+    if misfit.applied:
+        used = "corrected"
     return (
         f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; the gains are those "
         f"of the {used} geometry"
@@ -187,7 +201,9 @@ def _correction_text(one: GeometryCorrection) -> str:
     if one.kind == "place":
         size = f"{1e3 * one.change:+.4f} ± {std_mm:.4f} mm"
         return f"the place of {one.joint} on the base off by {size} in {one.end} (to be added to it)"
-    longer = "longer" if one.change > 0.0 else "shorter"
+    longer = "shorter"
+    if one.change > 0.0:
+        longer = "longer"
     size = f"{1e3 * abs(one.change):.4f} ± {std_mm:.4f} mm"
     return f"a {one.kind} from {one.joint} to {one.end} that is {size} {longer} than described"
 
@@ -221,14 +237,13 @@ def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     units = {gain.axis: gain.unit for gain in calibration.gains}
     for one in calibration.payload_mass:
         for gain in one.gains:
-            yield (
-                one.payload,
-                gain.axis,
-                f"{gain.per_kg:.4g}",
-                f"{gain.percent_per_percent:.3f}",
-                f"{gain.tolerance_std:.2g}" if one.tolerance_kg > 0.0 else "-",
-                units.get(gain.axis, ""),
-            )
+            tolerance_std = "-"
+            if one.tolerance_kg > 0.0:
+                tolerance_std = f"{gain.tolerance_std:.2g}"
+            per_kg = f"{gain.per_kg:.4g}"
+            per_percent = f"{gain.percent_per_percent:.3f}"
+            unit = units.get(gain.axis, "")
+            yield (one.payload, gain.axis, per_kg, per_percent, tolerance_std, unit)
 
 
 def value_rows(parameters: Iterable[Parameter]) -> list[tuple[str, str, str]]:

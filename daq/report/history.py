@@ -22,12 +22,13 @@ from daq.ledger.audit import BACKUPS_WITHOUT_LOG, head_file
 from daq.ledger.fold import Entry, Event, History, WriteAction
 from daq.ledger.ledger import Verification
 from daq.ledger.names import drives_of
-from daq.ledger.watch import Series, alarm_text, pattern_of, questions
+from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
 from daq.writeback.file_access import resolve_links
+from ident.calibration import Gain
 from ident.drift.change import CHART
 
 if TYPE_CHECKING:
@@ -222,24 +223,29 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
         console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
 
 
+def _points_of(series: Series, entry: Entry) -> list[tuple[Series, int, Point]]:
+    """Return the points of a calibration in the series of an axis, each with its index."""
+    points = enumerate(series.points)
+    return [(series, index, point) for index, point in points if point.entry.digest == entry.digest]
+
+
 def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]) -> Table:
     """One row a calibration."""
     headings = ("recorded (UTC)", "calibration", "error %", "largest change", "alarms", "applied")
     table = plain_table(headings, left=(0, 1, 4, 5), wrap=(5,))
     for entry in sorted(entries, key=lambda one: one.recorded):
-        points = [
-            (series, index, point)
-            for series in all_series
-            for index, point in enumerate(series.points)
-            if point.entry.digest == entry.digest
-        ]
+        points: list[tuple[Series, int, Point]] = []
+        for series in all_series:
+            points += _points_of(series, entry)
         alarms = [series.axis for series, index, _ in points if series.alarm_at(index) is not None]
         changes = [(point.change, point.gain.axis) for _, _, point in points if point.change is not None]
         largest = "-"
         if changes:
             change, axis = max(changes, key=lambda pair: abs(pair[0].sigmas))
             largest = f"{printable(axis)} {change.percent:+.1f} % {abs(change.sigmas):.1f} σ"
-        error = entry.error_percent if entry.holdout_percent is None else entry.holdout_percent
+        error = entry.holdout_percent
+        if error is None:
+            error = entry.error_percent
         table.add_row(
             f"{entry.recorded:%Y-%m-%d %H:%M}",
             entry.digest[:8],
@@ -261,18 +267,25 @@ def history_gain_table(all_series: Sequence[Series]) -> Table:
             continue
         gain = series.points[-1].gain
         count = len(series.points) - series.began
-        drift = series.drift if count > 1 else None
+        drift = None
+        if count > 1:
+            drift = series.drift
         state = f"baseline: {count} of {CHART.baseline}"
         if series.alarmed:
             state = "ALARM"
         elif count > CHART.baseline:
             state = "ok"
+        change_percent = "-"
+        change_sigmas = "-"
+        if drift is not None:
+            change_percent = f"{drift.change_percent:+.2f}"
+            change_sigmas = f"{abs(drift.change_sigmas):.1f}"
         table.add_row(
             printable(series.axis),
             with_deviation(gain.value, gain.std),
             f"{gain.nameplate:.4g}",
-            "-" if drift is None else f"{drift.change_percent:+.2f}",
-            "-" if drift is None else f"{abs(drift.change_sigmas):.1f}",
+            change_percent,
+            change_sigmas,
             state,
             printable(series.unit),
         )
@@ -287,15 +300,24 @@ def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
         stretch = series.stretch_at(index)
         place = index - stretch.began
         alarm = series.alarm_at(index)
+        change_percent = "-"
+        change_sigmas = "-"
+        if point.change is not None:
+            change_percent = f"{point.change.percent:+.2f}"
+            change_sigmas = f"{abs(point.change.sigmas):.1f}"
+        kind = "-"
+        if alarm is not None:
+            kind = alarm.kind.value
+        drift = stretch.drift
         table.add_row(
             f"{point.entry.recorded:%Y-%m-%d %H:%M}",
             with_deviation(point.gain.value, point.gain.std),
-            "-" if point.change is None else f"{point.change.percent:+.2f}",
-            "-" if point.change is None else f"{abs(point.change.sigmas):.1f}",
-            f"{stretch.drift.upper[place]:.1f}",
-            f"{stretch.drift.lower[place]:.1f}",
-            f"{stretch.drift.trend[place]:+.1f}",
-            "-" if alarm is None else alarm.kind.value,
+            change_percent,
+            change_sigmas,
+            f"{drift.upper[place]:.1f}",
+            f"{drift.lower[place]:.1f}",
+            f"{drift.trend[place]:+.1f}",
+            kind,
             printable(actions[point.entry.digest]),
         )
     return table
@@ -319,7 +341,9 @@ def history_report(
         in_force: digest of the calibration whose gains are the current gains.
         checked: state of audit log and history; None where it was not asked for.
     """
-    others: dict[str, Any] = {} if checked is None else {"audit": audit_report(checked)}
+    others: dict[str, Any] = {}
+    if checked is not None:
+        others = {"audit": audit_report(checked)}
     if history.other_robots:
         others["other_robots"] = [str(one) for one in history.other_robots]
     return HistoryReport.of(
@@ -329,26 +353,29 @@ def history_report(
         chart=asdict(CHART),
         pattern=pattern_of(all_series),
         questions=questions(all_series),
-        axes=[
-            HistoryAxis.of(
-                series,
-                series.drift,
-                alarm=alarm_text(series),
-                since=series.onset,
-                points=history_points(series),
-            )
-            for series in chosen
-        ],
+        axes=[_history_axis(series) for series in chosen],
         **others,
+    )
+
+
+def _history_axis(series: Series) -> HistoryAxis:
+    return HistoryAxis.of(
+        series,
+        series.drift,
+        alarm=alarm_text(series),
+        since=series.onset,
+        points=history_points(series),
     )
 
 
 def say_verification(found: Verification, console: Console) -> None:
     """Print the state of audit log and history; flaws are in the error."""
     verdict = found.verdict
-    console.print(
-        f"{found.audit}: {counted(len(verdict.entries), 'entry')}, chain {'unbroken' if verdict.holds else 'BROKEN'}."
-    )
+    chain = "BROKEN"
+    if verdict.holds:
+        chain = "unbroken"
+    entries = counted(len(verdict.entries), "entry")
+    console.print(f"{found.audit}: {entries}, chain {chain}.")
     if not found.noted:
         console.print(
             f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of the audit log would "
@@ -383,20 +410,23 @@ def say_verification(found: Verification, console: Console) -> None:
 def audit_report(found: Verification) -> AuditReport:
     """Return the state of audit log and history."""
     verdict = found.verdict
+    open_writes = []
+    for write in verdict.open_writes:
+        begun = write.begun
+        open_writes.append(UnendedWrite.of(begun, file=begun.subject, content=write.content))
+    unknown_writes = []
+    for unknown in found.unknown:
+        ended = unknown.ended
+        unknown_writes.append(UnknownWrite.of(ended, file=ended.subject, calibration_sha256=unknown.calibration))
     return AuditReport.of(
         verdict,
         file=found.audit,
         entries=len(verdict.entries),
         broken_line=verdict.broken,
         torn_lines=verdict.torn,
-        open_writes=[
-            UnendedWrite.of(one.begun, file=one.begun.subject, content=one.content) for one in verdict.open_writes
-        ],
+        open_writes=open_writes,
         history_broken=[printable(one) for one in found.broken],
-        unknown_writes=[
-            UnknownWrite.of(one.ended, file=one.ended.subject, calibration_sha256=one.calibration)
-            for one in found.unknown
-        ],
+        unknown_writes=unknown_writes,
     )
 
 
@@ -413,14 +443,19 @@ def in_force(cell: Cell, history: History) -> str | None:
     (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts. None where the
     file has other numbers than every calibration, or cannot be read.
     """
-    controller, file = cell.controller, cell.controller_path
+    controller = cell.controller
+    file = cell.controller_path
     if controller is None:
         return None
     if file is None or not controller.gains:
-        return history.in_force(drives_of(cell.name)) if controller.objects else None
+        if controller.objects:
+            return history.in_force(drives_of(cell.name))
+        return None
     try:
         target = str(resolve_links(file))
-        scalars = decode_document(read_controller_file(file), str(file), controller.format).locate(controller.keys)
+        content = read_controller_file(file)
+        document = decode_document(content, str(file), controller.format)
+        scalars = document.locate(controller.keys)
     except (ControllerUnfit, OSError):
         return None
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
@@ -446,7 +481,8 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
         if mine:
             last = events[mine[-1]]
             parts.append(f"{_WORDS[last.action]} {last.who}")
-            then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
+            later = events[mine[-1] + 1 :]
+            then = next((event for event in later if event.target == last.target), None)
             if then is not None and then.action is WriteAction.ROLLED_BACK:
                 parts.append(f"rolled back by {then.who}")
         if entry.acceptance is not None:
@@ -458,14 +494,21 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
     return described
 
 
+def _is_known(gain: Gain) -> bool:
+    return math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0.0
+
+
 def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
     """Whether a write of this calibration would change no number."""
     if {gain.axis for gain in entry.gains} != numbers.keys():
         return False
-    if not all(math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value for gain in entry.gains):
+    if not all(_is_known(gain) for gain in entry.gains):
         return False
     try:
-        put = [rewrite_gain(numbers[gain.axis][0], gain.value, gain.std, numbers[gain.axis][1]) for gain in entry.gains]
+        put = []
+        for gain in entry.gains:
+            number, scale = numbers[gain.axis]
+            put.append(rewrite_gain(number, gain.value, gain.std, scale))
     except ControllerUnfit:
         return False
     return all(one.new == one.current_gain for one in put)
@@ -530,7 +573,9 @@ def _history_point(series: Series, index: int) -> HistoryPoint:
 
 
 _COLUMNS = 2
-_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
+#: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
+_FIRST_DAY = -719_162.0
+_LAST_DAY = 2_932_896.999
 
 
 def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
@@ -552,12 +597,18 @@ def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> byte
     in_last_band = len(all_series) - columns * (bands - 1)
     for place in grid[-1, :, in_last_band:].flat:
         place.set_axis_off()
-    days = [_days(point.entry.recorded) for series in all_series for point in series.points]
+    days: list[float] = []
+    for series in all_series:
+        days += [_days(point.entry.recorded) for point in series.points]
+    first_day = min(days)
+    last_day = max(days)
     # Of a single day there would be no range to label.
-    beside = max(0.5, 0.03 * (max(days) - min(days)))
+    margin = max(0.5, 0.03 * (last_day - first_day))
+    begin = max(first_day - margin, _FIRST_DAY)
+    end = min(last_day + margin, _LAST_DAY)
     for place in places:
-        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
-        # At most so many labels as fit beside each other.
+        place.set_xlim(begin, end)
+        # At most so many labels as fit next to each other.
         locator = dates.AutoDateLocator(maxticks=7)
         place.xaxis.set_major_locator(locator)
         place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
@@ -578,15 +629,18 @@ def _draw_gains(place: Axes, series: Series) -> None:
     label = f"gain ± {SHOWN_SIGMAS:g} σ"
     place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
     place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=label)
-    held = np.array([point.entry.applied for point in points], dtype=np.bool_)
-    place.plot(times[held], values[held], "o", color=BLUE, markersize=4, label="applied")
-    alarmed = np.array([series.alarm_at(index) is not None for index in range(len(points))], dtype=np.bool_)
+    applied = np.array([point.entry.applied for point in points], dtype=np.bool_)
+    place.plot(times[applied], values[applied], "o", color=BLUE, markersize=4, label="applied")
+    alarms = [series.alarm_at(index) for index in range(len(points))]
+    alarmed = np.array([alarm is not None for alarm in alarms], dtype=np.bool_)
     place.plot(times[alarmed], values[alarmed], "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
     for stretch in series.stretches:
         drift = stretch.drift
         ends = times[[stretch.began, stretch.ended - 1]]
         half = SHOWN_SIGMAS * drift.baseline_std
-        place.fill_between(ends, drift.baseline - half, drift.baseline + half, color=SKY, alpha=0.3, linewidth=0)
+        lower = drift.baseline - half
+        upper = drift.baseline + half
+        place.fill_between(ends, lower, upper, color=SKY, alpha=0.3, linewidth=0)
         place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
         if drift.steady:
             reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
@@ -601,12 +655,16 @@ def _draw_limits(place: Axes, series: Series) -> None:
     for sign in (-1.0, 1.0):
         place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
     for stretch in series.stretches:
-        times = [_days(point.entry.recorded) for point in series.points[stretch.began : stretch.ended]]
+        points = series.points[stretch.began : stretch.ended]
+        times = [_days(point.entry.recorded) for point in points]
         drift = stretch.drift
         for sums in (drift.upper, -drift.lower):
-            place.step(times, sums / CHART.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
-        place.plot(times, drift.trend / CHART.trend, color=PURPLE, linewidth=1.0, label="trend")
-        place.plot(times, drift.deviations / CHART.single, ".", color=GREY, markersize=4, label="one calibration")
+            share = sums / CHART.threshold
+            place.step(times, share, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
+        trend = drift.trend / CHART.trend
+        single = drift.deviations / CHART.single
+        place.plot(times, trend, color=PURPLE, linewidth=1.0, label="trend")
+        place.plot(times, single, ".", color=GREY, markersize=4, label="one calibration")
     place.set_ylabel("over its limit", fontsize=8)
 
 

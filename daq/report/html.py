@@ -165,9 +165,13 @@ def html_document(title: str, mark: str, style: str, body: str, script: str = ""
         script: the only script.
     """
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    allowed = f" script-src 'sha256-{digest}';" if script else ""
+    allowed = ""
+    if script:
+        allowed = f" script-src 'sha256-{digest}';"
     policy = f"default-src 'none';{allowed} img-src data:; style-src 'unsafe-inline'"
-    ending = f"<script>{script}</script>\n" if script else ""
+    ending = ""
+    if script:
+        ending = f"<script>{script}</script>\n"
     return f"""\
 <!DOCTYPE html>
 <html lang="en">
@@ -188,7 +192,9 @@ def html_document(title: str, mark: str, style: str, body: str, script: str = ""
 
 def element(tag: str, text: str, kind: str = "") -> str:
     """Build an element of plain text, `code` between back quotes; its kind is a CSS class."""
-    named = f' class="{kind}"' if kind else ""
+    named = ""
+    if kind:
+        named = f' class="{kind}"'
     words = _CODE.sub(_code, spelled(text))
     return f"<{tag}{named}>{words}</{tag}>"
 
@@ -247,7 +253,9 @@ def terms(pairs: Iterable[tuple[str, str]]) -> str:
     """Build a list of names with their values."""
     parts = []
     for name, value in pairs:
-        kind = "long" if len(value) > _LONG else ""
+        kind = ""
+        if len(value) > _LONG:
+            kind = "long"
         parts.append(element("dt", name, kind))
         parts.append(element("dd", value, kind))
     return f"<dl>{''.join(parts)}</dl>"
@@ -261,24 +269,45 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], 
     "stacked" is for long names and few numbers: a phone shows the numbers below the name.
     """
     lines = list(rows)
-    texts = [not all(_NUMBER.fullmatch(line[column]) for line in lines) for column in range(len(headings))]
-    kinds = [' class="text"' if text else "" for text in texts]
+    styles = []
+    for column in range(len(headings)):
+        cells_of_column = [line[column] for line in lines]
+        styles.append(_alignment(cells_of_column))
     names = [spelled(heading) for heading in headings]
-    head = "".join(f'<th scope="col"{style}>{name}</th>' for name, style in zip(names, kinds, strict=True))
-    made = [f'<table class="{kind}">' if kind else "<table>", element("caption", caption) if caption else ""]
-    made += [f"<thead><tr>{head}</tr></thead>", "<tbody>"]
+    columns = list(zip(names, styles, strict=True))
+    head = "".join(f'<th scope="col"{style}>{name}</th>' for name, style in columns)
+    opening = "<table>"
+    if kind:
+        opening = f'<table class="{kind}">'
+    parts = ['<div class="scroll">', opening, _optional("caption", caption)]
+    parts += [f"<thead><tr>{head}</tr></thead>", "<tbody>"]
     for first, *others in lines:
-        cells = "".join(
-            f'<td{style} data-name="{name}">{spelled(one)}</td>'
-            for one, name, style in zip(others, names[1:], kinds[1:], strict=True)
-        )
-        made.append(f'<tr><th scope="row">{spelled(first)}</th>{cells}</tr>')
-    return "\n".join(('<div class="scroll">', *made, "</tbody></table>", "</div>"))
+        cells = ""
+        for text, (name, style) in zip(others, columns[1:], strict=True):
+            cells += f'<td{style} data-name="{name}">{spelled(text)}</td>'
+        parts.append(f'<tr><th scope="row">{spelled(first)}</th>{cells}</tr>')
+    parts += ["</tbody></table>", "</div>"]
+    return "\n".join(parts)
+
+
+def _alignment(cells: Iterable[str]) -> str:
+    """Return the attribute of a column with any cell that is no number; empty for one of numbers."""
+    if all(_NUMBER.fullmatch(cell) for cell in cells):
+        return ""
+    return ' class="text"'
+
+
+def _optional(tag: str, text: str) -> str:
+    """Build an element of plain text; empty where there is none."""
+    if not text:
+        return ""
+    return element(tag, text)
 
 
 def figure(svg: str, caption: str = "", title: str = "") -> str:
     """Show a drawing of `daq.report.svg` under its title, with its caption."""
-    head, foot = (element(tag, text) if text else "" for tag, text in (("h3", title), ("figcaption", caption)))
+    head = _optional("h3", title)
+    foot = _optional("figcaption", caption)
     return f"<figure>{head}{svg}{foot}</figure>"
 
 
@@ -298,4 +327,10 @@ def visible_text(text: str) -> str:
     HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category
     Cf) can make a name look like another.
     """
-    return "".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text)
+    return "".join(map(_visible, text))
+
+
+def _visible(character: str) -> str:
+    if character == "\n" or category(character) not in _UNSEEN:
+        return character
+    return f"\\u{ord(character):04x}"

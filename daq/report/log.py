@@ -278,7 +278,10 @@ def timing_text(timing: Timing) -> str:
         (timing.close, "too close to the one before and dropped"),
     )
     parts += [f"{count} {text}" for count, text in counts if count]
-    return f"{'resampled to' if timing.resampled else 'uniform at'} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
+    how = "uniform at"
+    if timing.resampled:
+        how = "resampled to"
+    return f"{how} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
 
 
 FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})
@@ -294,17 +297,29 @@ def log_lines(description: Mapping[str, Any], width: int) -> Iterator[Text]:
         yield from map(Text, entry_lines(key.replace("_", " "), text, indent, width))
 
 
+def _yes_or_no(value: bool) -> str:
+    if value:
+        return "yes"
+    return "no"
+
+
 def _readable(value: Any) -> str:
     if value is None or value in ("", [], {}):
         return "-"
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        return _yes_or_no(value)
     if isinstance(value, float):
-        # An exponent is for programs: 1234567.8 s is 1234568, not 1.23457e+06.
-        whole = f"{value:.0f}"
-        return whole if len(whole) > 6 and abs(value) < 1e15 else f"{value:g}"
+        return _readable_float(value)
     if isinstance(value, dict):
         return ", ".join(f"{key} {_readable(item)}" for key, item in value.items())
     if isinstance(value, list):
         return ", ".join(_readable(item) for item in value)
     return str(value)
+
+
+def _readable_float(value: float) -> str:
+    # An exponent is for programs: 1234567.8 s is 1234568, not 1.23457e+06.
+    rounded = f"{value:.0f}"
+    if len(rounded) > 6 and abs(value) < 1e15:
+        return rounded
+    return f"{value:g}"

@@ -11,6 +11,7 @@ from rich.console import RenderableType
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.validate import NAMEPLATE_LABEL, CrossValidation
 from ident.calibration import Calibration, Gain, Parameter
+from ident.estimators.estimate import RelativeError
 
 NONE = "—"
 ERROR_ROW = "difference from the scale, %"
@@ -30,20 +31,25 @@ class PaperTable:
     @property
     def numbered_title(self) -> str:
         """Title with the number of the paper's table, for a reader who compares the two."""
-        return self.title if self.number is None else f"Table {self.number}: {self.title}"
+        if self.number is None:
+            return self.title
+        return f"Table {self.number}: {self.title}"
 
     def markdown(self) -> str:
         """Section of a Markdown page."""
-        rule = ("---", *("---:" for _ in self.headings[1:]))
-        rows = (" | ".join(cell.replace("|", r"\|") for cell in cells) for cells in (self.headings, rule, *self.rows))
-        lines = [f"## {self.numbered_title}", "", *(f"| {row} |" for row in rows)]
+        right_aligned = ["---:"] * (len(self.headings) - 1)
+        rule = ("---", *right_aligned)
+        lines = [f"## {self.numbered_title}", ""]
+        lines += map(_markdown_row, (self.headings, rule, *self.rows))
         for note in self.notes:
             lines += ["", note]
         return "\n".join(lines) + "\n"
 
     def view(self, *, numbered: bool = True) -> Iterator[RenderableType]:
         """Table and notes for a terminal, with the paper's number or without."""
-        title = self.numbered_title if numbered else f"{self.title[0].upper()}{self.title[1:]}"
+        title = self.numbered_title
+        if not numbered:
+            title = f"{self.title[0].upper()}{self.title[1:]}"
         table = plain_table(self.headings, title=title, wrap=range(len(self.headings)))
         for row in self.rows:
             table.add_row(*map(terminal_text, row))
@@ -51,12 +57,19 @@ class PaperTable:
         yield from map(printable, self.notes)
 
 
+def _markdown_row(cells: Sequence[str]) -> str:
+    escaped = [cell.replace("|", r"\|") for cell in cells]
+    return f"| {' | '.join(escaped)} |"
+
+
 def case_tables(calibrations: Mapping[str, Calibration]) -> tuple[PaperTable, ...]:
     """Build Tables 1 to 4 from the calibrations by name of their case."""
     tables: list[PaperTable] = []
     for number, method in ((1, "IDIM-WLS"), (3, "IDIM-TLS")):
-        pair = calibrations[f"case-{number}"], calibrations[f"case-{number + 1}"]
-        tables += [parameter_table(number, *pair, method), paper_gain_table(number + 1, *pair, method)]
+        first = calibrations[f"case-{number}"]
+        second = calibrations[f"case-{number + 1}"]
+        tables.append(parameter_table(number, first, second, method))
+        tables.append(paper_gain_table(number + 1, first, second, method))
     return tuple(tables)
 
 
@@ -76,36 +89,48 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
             if one.std > 0.0:
                 differences.append(difference)
         leading, *regrouped = name.split()
-        short = f"{leading} R" if regrouped else leading
+        short = leading
+        if regrouped:
+            short = f"{leading} R"
         rows.append((short, *_parameter(one), *_parameter(other), percent(difference)))
-    left, other_left = (f"{fit.relative_error_percent.total:.2f} %" for fit in (first, second))
+    left = f"{first.relative_error_percent.total:.2f} %"
+    other_left = f"{second.relative_error_percent.total:.2f} %"
+    rows.append(("‖ρ‖/‖Y‖", left, "", other_left, "", ""))
+    mean = percent(_mean(differences))
+    note = (
+        f"%e is the difference from the first value; its mean is {mean} %. "
+        f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units."
+    )
     return PaperTable(
         number=number,
         title=f"essential parameters, {method}",
         headings=("parameter", "10 CAD: value", "%σ", "mass alone: value", "%σ", "%e"),
-        rows=(*rows, ("‖ρ‖/‖Y‖", left, "", other_left, "", "")),
-        notes=(
-            f"%e is the difference from the first value; its mean is {percent(_mean(differences))} %. "
-            f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units.",
-            SIGMA_NOTE,
-        ),
+        rows=tuple(rows),
+        notes=(note, SIGMA_NOTE),
     )
 
 
 def paper_gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
     """Build Table 2 or 4: nameplate and identified gains, with the payload's drawing and with its mass alone."""
-    rows = [
-        (one.axis, f"{one.nameplate:.4g}", *_gain_cells(one), *_gain_cells(other))
-        for one, other in zip(first.gains, second.gains, strict=True)
-    ]
-    means = [_mean([abs(gain.change_percent) for gain in c.gains]) for c in (first, second)]
+    rows: list[tuple[str, ...]] = []
+    for one, other in zip(first.gains, second.gains, strict=True):
+        nameplate = f"{one.nameplate:.4g}"
+        rows.append((one.axis, nameplate, *_gain_cells(one), *_gain_cells(other)))
+    mean = percent(_mean_change(first))
+    other_mean = percent(_mean_change(second))
+    rows.append(("mean", "", "", "", mean, "", "", other_mean))
     return PaperTable(
         number=number,
         title=f"drive gains, {method}",
         headings=("axis", "nameplate", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
-        rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
+        rows=tuple(rows),
         notes=("%e is the change from the nameplate.", SIGMA_NOTE),
     )
+
+
+def _mean_change(calibration: Calibration) -> float | None:
+    """Mean size of the changes from the nameplate [%]."""
+    return _mean([abs(gain.change_percent) for gain in calibration.gains])
 
 
 def _gain_cells(gain: Gain) -> tuple[str, str, str]:
@@ -114,11 +139,18 @@ def _gain_cells(gain: Gain) -> tuple[str, str, str]:
 
 def condition_table(found: CrossValidation) -> PaperTable:
     """Build Table 5: condition number of each run."""
+    names = [run.run for run in found.runs]
+    conditions = []
+    for run in found.runs:
+        condition = NONE
+        if run.condition is not None:
+            condition = f"{run.condition:.0f}"
+        conditions.append(condition)
     return PaperTable(
         number=5,
         title="condition number of each run's observation matrix",
-        headings=("", *(run.run for run in found.runs)),
-        rows=(("cond(W)", *(NONE if run.condition is None else f"{run.condition:.0f}" for run in found.runs)),),
+        headings=("", *names),
+        rows=(("cond(W)", *conditions),),
         notes=(
             "The smaller the number, the more evenly the moves show all base parameters. The payload counts as part of "
             "the last link. `plan` allows 3500, and 1e5 for a closed chain.",
@@ -128,26 +160,41 @@ def condition_table(found: CrossValidation) -> PaperTable:
 
 def paper_error_table(found: CrossValidation) -> PaperTable:
     """Build Table 6: relative error of each run and joint by every calibration."""
-    labels, axes = tuple(found.calibrations), found.axes
-    rows = []
+    labels = tuple(found.calibrations)
+    axes = found.axes
+    rows: list[tuple[str, ...]] = []
     for run in found.runs:
+        if not run.errors:
+            continue
         errors = [run.errors.get(label) for label in labels]
-        for index, axis in enumerate(axes if run.errors else ()):
-            cells = (NONE if error is None else percent(error.axes[index]) for error in errors)
+        for index, axis in enumerate(axes):
+            cells = [_axis_error(error, index) for error in errors]
             rows.append((f"{run.run}, {axis}", *cells))
+    means = [percent(_mean_error(found, label)) for label in labels]
+    rows.append(("mean", *means))
     reasons: dict[str, list[str]] = {}
     for run in found.runs:
         if run.left_out:
             reasons.setdefault(run.left_out, []).append(run.run)
-    unmet = [f"{', '.join(runs)}: {reason}." for reason, runs in reasons.items()]
+    notes = []
     seen = sorted({run.run for run in found.runs if run.seen_by})
+    if seen:
+        notes.append(f"Used by a fit: {', '.join(seen)}.")
+    for reason, runs in reasons.items():
+        notes.append(f"{', '.join(runs)}: {reason}.")
     return PaperTable(
         number=6,
         title="relative error norms ‖ρ‖/‖Y‖ [%]",
         headings=("run, joint", *labels),
-        rows=(*rows, ("mean", *(percent(_mean_error(found, label)) for label in labels))),
-        notes=(*([f"Used by a fit: {', '.join(seen)}."] if seen else ()), *unmet),
+        rows=tuple(rows),
+        notes=tuple(notes),
     )
+
+
+def _axis_error(error: RelativeError | None, index: int) -> str:
+    if error is None:
+        return NONE
+    return percent(error.axes[index])
 
 
 def _mean_error(found: CrossValidation, label: str) -> float | None:
@@ -162,15 +209,18 @@ def _mean_error(found: CrossValidation, label: str) -> float | None:
 def mass_tables(found: CrossValidation) -> tuple[PaperTable, ...]:
     """Build Tables 7 and 8, one for each payload."""
     payloads = dict.fromkeys((run.payload.name, run.payload.mounting) for run in found.weighed)
-    return tuple(
-        _mass_table(found, name, mounting, 7 + index if index < 2 else 8)
-        for index, (name, mounting) in enumerate(payloads)
-    )
+    tables = []
+    for index, (name, mounting) in enumerate(payloads):
+        number = min(7 + index, 8)
+        tables.append(_mass_table(found, name, mounting, number))
+    return tuple(tables)
 
 
 def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -> PaperTable:
     runs = [run for run in found.weighed if (run.payload.name, run.payload.mounting) == (name, mounting)]
-    labels = dict.fromkeys(label for run in runs for label in run.masses)
+    labels: dict[str, None] = {}
+    for run in runs:
+        labels |= dict.fromkeys(run.masses)
     rows: list[tuple[str, ...]] = []
     errors: dict[str, list[float]] = {label: [] for label in labels}
     notes = []
@@ -194,54 +244,67 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     weighed = "not weighed"
     if runs[0].weighed_kg is not None:
         weighed = f"{runs[0].weighed_kg:g} kg"
-        rows.append((f"mean {ERROR_ROW}", *(percent(_mean(errors[label])) for label in labels)))
+        means = [percent(_mean(errors[label])) for label in labels]
+        rows.append((f"mean {ERROR_ROW}", *means))
     how = "payload and friction are estimated from this run, the robot is that of the calibration"
     if found.with_bare_runs:
         how = "robot and payload are estimated together, from this run and the runs without load"
     # The label is a key of documents; a reader knows these gains as the nameplate.
-    shown = ("nameplate" if label == NAMEPLATE_LABEL and label not in found.calibrations else label for label in labels)
+    shown = list(labels)
+    if NAMEPLATE_LABEL in labels and NAMEPLATE_LABEL not in found.calibrations:
+        shown[shown.index(NAMEPLATE_LABEL)] = "nameplate"
+    explanation = (
+        f"Each column weighs with its own gains: {how}. Gains that find the right mass may still be wrong, because "
+        "errors of several axes can cancel."
+    )
     return PaperTable(
         number=number,
         title=f"mass of payload {name} ({mounting}), {weighed}",
         headings=("run", *shown),
         rows=tuple(rows),
-        notes=(
-            f"Each column weighs with its own gains: {how}. Gains that find the right mass may still be wrong, because "
-            "errors of several axes can cancel.",
-            *dict.fromkeys(notes),
-        ),
+        notes=(explanation, *dict.fromkeys(notes)),
     )
 
 
 def paper_page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
     """Markdown page of tables; its first line names the kind of file, so that no other file is overwritten."""
-    return f"<!-- format: {marker} -->\n# {title}\n\n" + "\n".join(table.markdown() for table in tables)
+    sections = "\n".join(table.markdown() for table in tables)
+    return f"<!-- format: {marker} -->\n# {title}\n\n{sections}"
 
 
 def percent(value: float | None) -> str:
     """Two decimals, none from 100 % on; a dash for an unknown value."""
     if value is None or not math.isfinite(value):
         return NONE
-    return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.0f}"
+    if abs(value) < 99.995:
+        return f"{value:.2f}"
+    return f"{value:.0f}"
 
 
 def _parameter(parameter: Parameter | None) -> tuple[str, str]:
     if parameter is None:
         return NONE, NONE
-    deviation = percent(100.0 * parameter.std / abs(parameter.value)) if parameter.std and parameter.value else NONE
+    deviation = NONE
+    if parameter.std and parameter.value:
+        deviation = percent(100.0 * parameter.std / abs(parameter.value))
     return f"{parameter.value:.3g}", deviation
 
 
 def _in_order(first: list[str], second: list[str]) -> list[str]:
-    """Merge two lists of names, keeping the order of each."""
+    """Merge two lists of names in the order of each."""
     order = list(first)
     for index, name in enumerate(second):
         if name not in order:
-            before = next((n for n in reversed(second[:index]) if n in order), None)
-            order.insert(0 if before is None else order.index(before) + 1, name)
+            known = [earlier for earlier in second[:index] if earlier in order]
+            place = 0
+            if known:
+                place = order.index(known[-1]) + 1
+            order.insert(place, name)
     return order
 
 
 def _mean(values: Sequence[float]) -> float | None:
     usable = [value for value in values if math.isfinite(value)]
-    return sum(usable) / len(usable) if usable else None
+    if usable:
+        return sum(usable) / len(usable)
+    return None

@@ -6,6 +6,7 @@ import io
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -30,7 +31,10 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
     """Make a figure of `count` small multiples that share their horizontal axis, filled row by row."""
     columns = min(columns, count)
     rows = -(-count // columns)
-    figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
+    panel_width_in, panel_height_in = _PANEL_IN
+    width_in = max(panel_width_in * columns, 7.5)
+    height_in = panel_height_in * rows + _TITLE_AND_LEGEND_IN
+    figure = _figure(title, width_in, height_in)
     places: list[Axes] = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
     for empty in places[count:]:
         empty.set_axis_off()
@@ -62,7 +66,10 @@ def _figure(title: str, width_in: float, height_in: float) -> Figure:
 
 def legend_below(figure: Figure, *places: Axes) -> None:
     """Draw one legend for all panels, outside of them, so that it covers no data."""
-    pairs = [pair for place in places for pair in zip(*place.get_legend_handles_labels(), strict=True)]
+    pairs: list[tuple[Artist, str]] = []
+    for place in places:
+        handles, labels = place.get_legend_handles_labels()
+        pairs += zip(handles, labels, strict=True)
     named = {label: handle for handle, label in reversed(pairs)}
     figure.legend(
         list(reversed(named.values())),

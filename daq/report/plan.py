@@ -55,6 +55,7 @@ class PlanReport(Report):
 
 def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability) -> PlanReport:
     """Return a plan, with the verdict on the gain of each axis."""
+    gains = [_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)]
     return PlanReport.of(
         made,
         judged,
@@ -65,19 +66,22 @@ def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judge
         condition=round(made.condition, 1),
         assumed=experiment.remarks,
         hidden=judged.sentences(cell.axis_names),
-        gains=[_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)],
+        gains=gains,
     )
 
 
 def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
     known_percent = gain.known_preload_percent
+    if known_percent is not None:
+        known_percent = round(known_percent, 3)
+    alone_percent = {source: round(alone, 3) for source, alone in gain.alone_percent.items()}
     return PlannedGain.of(
         gain,
         axis=axis,
         predicted_std_percent=round(gain.std_percent, 3),
-        known_preload_std_percent=None if known_percent is None else round(known_percent, 3),
+        known_preload_std_percent=known_percent,
         seen_by=gain.sources,
-        alone_percent={source: round(alone, 3) for source, alone in gain.alone_percent.items()},
+        alone_percent=alone_percent,
         words=gain.words(axis),
     )
 
@@ -111,11 +115,14 @@ def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
     position = experiment.design.expectation.model.assembly.position_rad
 
     def listed(joints: tuple[int, ...]) -> str:
-        units = [joint_unit(robot.joints[joint].kind) for joint in joints]
-        # Adding zero removes the sign of a rounded -0.
-        values = (np.round(position[joint] / unit.si, 1) + 0.0 for joint, unit in zip(joints, units, strict=True))
-        parts = zip(joints, values, units, strict=True)
-        return ", ".join(f"{robot.joints[joint].name} {value:g} {unit.name}" for joint, value, unit in parts)
+        parts = []
+        for number in joints:
+            joint = robot.joints[number]
+            unit = joint_unit(joint.kind)
+            # Adding zero removes the sign of a rounded -0.
+            value = np.round(position[number] / unit.si, 1) + 0.0
+            parts.append(f"{joint.name} {value:g} {unit.name}")
+        return ", ".join(parts)
 
     yield (
         f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the motors' joints are at "
@@ -136,7 +143,9 @@ def plan_text(
 
     `requested_s` is the duration that the plan was allowed to have [s]; a longer one is proposed for weak gains.
     """
-    look = ", or look at it (--preview PAGE)" if preview is None else f": {preview} shows the moves"
+    look = f": {preview} shows the moves"
+    if preview is None:
+        look = ", or look at it (--preview PAGE)"
     way = "`record` checks the way to its first target from where the robot stands."
     if cell.clearance is None:
         way = "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
@@ -144,15 +153,16 @@ def plan_text(
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
         f"  {'axis':{width}}  predicted σ  verdict",
-        *(
-            f"  {axis.name:{width}}  {format_at_limit(gain.std_percent, GOOD_PERCENT, 2):>9} %  {gain.verdict.value}"
-            for axis, gain in zip(cell.axes, judged.gains, strict=True)
-        ),
-        *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged.gains, strict=True)),
-        *_on_all_gains(cell, made, judged, requested_s),
-        *_assembly(cell, experiment),
-        "Assumed:",
-        *(f"  {remark}" for remark in experiment.remarks),
-        f"Read the plan before the robot executes it{look}. {way}",
     ]
+    sentences = []
+    for axis, gain in zip(cell.axes, judged.gains, strict=True):
+        std_percent = format_at_limit(gain.std_percent, GOOD_PERCENT, 2)
+        lines.append(f"  {axis.name:{width}}  {std_percent:>9} %  {gain.verdict.value}")
+        sentences.append(f"  {gain.words(axis.name)}")
+    lines += sentences
+    lines += _on_all_gains(cell, made, judged, requested_s)
+    lines += _assembly(cell, experiment)
+    lines.append("Assumed:")
+    lines += [f"  {remark}" for remark in experiment.remarks]
+    lines.append(f"Read the plan before the robot executes it{look}. {way}")
     return "\n".join(lines)

@@ -23,9 +23,11 @@ from daq.workflow.experiment import PlannedMove, experiment_of, path_of
 from daq.workflow.plan import Plan
 from ident.arrays import FloatArray
 from ident.model.robot import poses
-from ident.planning.clearance import Checker
+from ident.planning.clearance import Box, Capsule, Checker
 
-STEP_S, LARGEST_ROWS = 0.04, 1500  #: Time between two rows of a preview, and their largest number
+#: Time between two rows of a preview, and their largest number
+STEP_S = 0.04
+LARGEST_ROWS = 1500
 MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
 _GRID_M = 0.25  #: Side of a square of the drawn plane z = 0
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
@@ -69,7 +71,9 @@ def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, pla
     drawn = preview_data(cell, moves, checker)
     data = json.dumps(drawn, separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")  # no name in it ends the script
-    planned_for = element("p", f"Planned for {purpose}", "act") if purpose else ""
+    planned_for = ""
+    if purpose:
+        planned_for = element("p", f"Planned for {purpose}", "act")
     body = f"""\
 {element("h1", f"Plan for cell {cell.name}: {len(moves)} moves in {drawn['time_s'][-1]:.0f} s")}
 {planned_for}
@@ -98,7 +102,7 @@ def save_preview(cell: Cell, plan: Plan, file: Path, page: Path) -> None:
         cell: with the limits.
         plan: as its file has it.
         file: of the plan; the page has its digest.
-        page: to write; a file of that name is replaced whole.
+        page: to write; a file of that name is replaced.
 
     Raises:
         OSError: from the file system.
@@ -124,29 +128,34 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
     # A box that reaches far beyond the arm, such as a floor, must not make the arm small.
     span = float(np.linalg.norm(np.ptp(seen, axis=0)))
     corners = np.array([(box.lower_m, box.upper_m) for box in boxes]).reshape(-1, 3)
-    corners = np.clip(corners, seen.min(axis=0) - span / 2, seen.max(axis=0) + span / 2)
+    lowest = seen.min(axis=0) - span / 2
+    highest = seen.max(axis=0) + span / 2
+    corners = np.clip(corners, lowest, highest)
     seen = np.concatenate((seen, corners))
     lower = seen.min(axis=0)
     upper = seen.max(axis=0)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
+    capsules = [_drawn_capsule(capsule) for capsule in scene.capsules]
+    drawn_boxes = []
+    for box in boxes:
+        is_obstacle = box is not scene.workspace
+        drawn_boxes.append(_drawn_box(box, is_obstacle=is_obstacle))
+    centre_m = 0.5 * (lower + upper)
+    diagonal_m = float(np.linalg.norm(upper - lower))
+    radius_m = 0.5 * diagonal_m + 0.05
+    speed_percent = 100.0 * np.abs(speed / limits)
+    speeds = []
+    for name, column in zip(cell.axis_names, speed_percent.T, strict=True):
+        speeds.append({"name": visible_text(name), "values": _rounded(column, 1)})
+    known_mm = [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()]
     return {
         "time_s": _rounded(time_s, 3),
         "move": move.tolist(),
         "moves": len(moves),
         "origins_m": _rounded(origins, 3),
         "ends_m": _rounded(ends_m, 3),
-        "capsules": [
-            {"name": visible_text(one.name), "link": one.link, "radius_m": one.radius_m} for one in scene.capsules
-        ],
-        "boxes": [
-            {
-                "name": visible_text(one.name),
-                "lower_m": one.lower_m,
-                "upper_m": one.upper_m,
-                "obstacle": one is not scene.workspace,
-            }
-            for one in boxes
-        ],
+        "capsules": capsules,
+        "boxes": drawn_boxes,
         "reach": {
             "lower_m": _rounded(reach.lower_m, 3),
             "upper_m": _rounded(reach.upper_m, 3),
@@ -154,55 +163,76 @@ def preview_data(cell: Cell, moves: Sequence[PlannedMove], checker: Checker) -> 
         },
         "grid_m": _GRID_M,
         "frame_m": [_rounded(lower, 3), _rounded(upper, 3)],
-        "centre_m": _rounded(0.5 * (lower + upper), 3),
-        "radius_m": round(0.5 * float(np.linalg.norm(upper - lower)) + 0.05, 3),
-        "clearance_mm": [round(value, 1) if np.isfinite(value) else None for value in clearance_mm.tolist()],
+        "centre_m": _rounded(centre_m, 3),
+        "radius_m": round(radius_m, 3),
+        "clearance_mm": known_mm,
         "minimum_mm": 1000.0 * scene.minimum_m,
-        "speeds": [
-            {"name": visible_text(name), "values": _rounded(column, 1)}
-            for name, column in zip(cell.axis_names, 100.0 * np.abs(speed / limits).T, strict=True)
-        ],
+        "speeds": speeds,
+    }
+
+
+def _drawn_capsule(capsule: Capsule) -> dict[str, Any]:
+    return {
+        "name": visible_text(capsule.name),
+        "link": capsule.link,
+        "radius_m": capsule.radius_m,
+    }
+
+
+def _drawn_box(box: Box, *, is_obstacle: bool) -> dict[str, Any]:
+    return {
+        "name": visible_text(box.name),
+        "lower_m": box.lower_m,
+        "upper_m": box.upper_m,
+        "obstacle": is_obstacle,
     }
 
 
 def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[str]:
     """List what a person must know before approving the plan, a sentence each."""
-    known = [pair for pair in zip(drawn["clearance_mm"], drawn["time_s"], strict=True) if pair[0] is not None]
+    rows = zip(drawn["clearance_mm"], drawn["time_s"], strict=True)
+    known = [(clearance_mm, at_s) for clearance_mm, at_s in rows if clearance_mm is not None]
     if known:
         least_mm, at_s = min(known)
         yield f"Smallest clearance: {least_mm:.0f} mm, at {at_s:.1f} s; {drawn['minimum_mm']:.0f} mm must be kept."
     reach = drawn["reach"]
     extents = zip("xyz", reach["lower_m"], reach["upper_m"], strict=True)
-    yield (
-        f"The moving parts stay within {', '.join(f'{name} {low:+.2f} to {high:+.2f}' for name, low, high in extents)} "
-        f"m, and within {reach['radius_m']:.2f} m of the z axis of the base."
-    )
+    ranges = ", ".join(f"{name} {low:+.2f} to {high:+.2f}" for name, low, high in extents)
+    radius_m = reach["radius_m"]
+    yield f"The moving parts stay within {ranges} m, and within {radius_m:.2f} m of the z axis of the base."
     if (lowest_m := reach["lower_m"][2]) < 0.0:
         yield f"They come {-lowest_m:.2f} m below z = 0, the plane of the grid: is there a floor or a table?"
     declared = cell.clearance is not None and bool(cell.clearance.capsules)
-    shape = "that of the cell file" if declared else "a guess from the URDF; the real arm may be thicker"
+    shape = "a guess from the URDF; the real arm may be thicker"
+    if declared:
+        shape = "that of the cell file"
     if cell.chain is not None and not declared:
         shape = "unknown: links of a closed chain are not guessed, and nothing keeps them apart"
     yield f"The shape of the arm is {shape}."
     bodies = {"obstacle": checker.scene.boxes, "workspace": checker.scene.workspace}
     if missing := [word for word, found in bodies.items() if not found]:
         yield f"The cell file declares no {' and no '.join(missing)}: tables, cables and people are not on this page."
-    checked = "drivegain record checks the way there" if cell.clearance is not None else "nothing checks the way there"
+    checked = "nothing checks the way there"
+    if cell.clearance is not None:
+        checked = "drivegain record checks the way there"
     yield f"The page starts at the first target. Where the robot stands before is not known here; {checked}."
 
 
 def _rows(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return time [s], position [rad or m], velocity and number of the move of each row, dwells included."""
     ways = [path_of(cell, np.array(before.target_rad), after) for before, after in pairwise(moves)]
-    lengths = [way.duration_s + after.dwell_s for way, after in zip(ways, moves[1:], strict=True)]
-    began = np.cumsum([moves[0].dwell_s, *lengths])
-    step_s = max(STEP_S, float(began[-1]) / LARGEST_ROWS)
-    time_s = np.arange(0.0, float(began[-1]) + step_s, step_s)
+    lengths_s = [way.duration_s + after.dwell_s for way, after in zip(ways, moves[1:], strict=True)]
+    began_s = np.cumsum([moves[0].dwell_s, *lengths_s])
+    duration_s = float(began_s[-1])
+    step_s = max(STEP_S, duration_s / LARGEST_ROWS)
+    time_s = np.arange(0.0, duration_s + step_s, step_s)
     position = np.tile(np.array(moves[0].target_rad), (len(time_s), 1))
-    velocity, number = np.zeros_like(position), np.ones(len(time_s))
+    velocity = np.zeros_like(position)
+    number = np.ones(len(time_s))
     for index, way in enumerate(ways):
-        rows = time_s >= began[index]
-        position[rows], velocity[rows], _ = way.at(time_s[rows] - began[index])
+        rows = time_s >= began_s[index]
+        since_s = time_s[rows] - began_s[index]
+        position[rows], velocity[rows], _ = way.at(since_s)
         number[rows] = index + 2
     return time_s, position, velocity, number
 
@@ -212,7 +242,7 @@ def _rounded(values: FloatArray, decimals: int) -> list[object]:
 
 
 def find_preview(plan: Path) -> Path | None:
-    """Return the page beside a plan that was made of exactly its content; None without one that can be read."""
+    """Return the page in the folder of a plan that shows exactly its content; None without one that can be read."""
     with suppress(OSError):
         mark = f'{MARK}{sha256(plan.read_bytes())}"'.encode()
         for page in sorted(plan.parent.glob("*.html")):

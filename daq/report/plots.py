@@ -38,35 +38,42 @@ def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | No
         OSError: from the file system.
     """
     before = start_of(fitted)
-    final = fitted.steps[-1].after if fitted.steps else before
-    title = f"Joint torques, {'first run of the fit' if final.holdout is None else 'a held-out run'}"
-    replace_file(out / "torques.svg", sheet(draw_torques(final, fitted.cell), title))
-    replace_file(out / "gains.png", plot_gains(calibration.gains, truth, title="Joint drive gains"))
+    final = before
+    if fitted.steps:
+        final = fitted.steps[-1].after
+    run = "a held-out run"
+    if final.holdout is None:
+        run = "first run of the fit"
+    torques = sheet(draw_torques(final, fitted.cell), f"Joint torques, {run}")
+    replace_file(out / "torques.svg", torques)
+    gains = plot_gains(calibration.gains, truth, title="Joint drive gains")
+    replace_file(out / "gains.png", gains)
     for step in fitted.steps:
-        for placed in (placed for placed in step.after.effects if placed not in before.effects):
+        for placed in step.after.effects:
+            if placed in before.effects:
+                continue
             axis = fitted.cell.place_names[placed.axis]
             title = f"{axis}: {effect_text(placed.effect, fitted.cell.place_names)}"
-            drawn = sheet(draw_effect(before, step.after, placed, fitted.cell), title)
-            replace_file(out / f"residual-{axis}-{placed.effect.name}.svg", drawn)
+            residual = draw_effect(before, step.after, placed, fitted.cell)
+            replace_file(out / f"residual-{axis}-{placed.effect.name}.svg", sheet(residual, title))
         before = step.after
 
 
 def _shown_rows(evidence: Evidence) -> Observation:
     """Held-out rows, or those of the fit where there are none."""
-    return evidence.training if evidence.holdout is None else evidence.holdout
+    if evidence.holdout is None:
+        return evidence.training
+    return evidence.holdout
 
 
 def draw_torques(final: Evidence, cell: Cell) -> tuple[str, ...]:
     """Draw measured and predicted torque of the first held-out run, or of the fit."""
     rows = _shown_rows(final)
     rows = rows.only(rows.run == rows.run[0])
-    return plot_torques(
-        rows.time_s,
-        np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T,
-        np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T,
-        cell.axis_names,
-        forces=tuple(axis.unit.force for axis in cell.axes),
-    )
+    measured_nm = np.where(rows.use, rows.torque(final.estimate.gains), np.nan)
+    predicted_nm = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan)
+    forces = tuple(axis.unit.force for axis in cell.axes)
+    return plot_torques(rows.time_s, measured_nm.T, predicted_nm.T, cell.axis_names, forces=forces)
 
 
 SHOWN_S = 10.0  #: Length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge
@@ -82,7 +89,7 @@ def plot_torques(
 ) -> tuple[str, ...]:
     """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
 
-    The relative error over each panel is that of the whole run, not only of the stretch that is drawn.
+    The relative error over each panel is that of all of the run, not only of the stretch that is drawn.
 
     Args:
         time_s: shape (k,) [s].
@@ -96,12 +103,12 @@ def plot_torques(
     use = np.isfinite(measured_nm) & np.isfinite(predicted_nm)
     errors = relative_error(measured_nm.T, predicted_nm.T, use.T)
     for index, (name, unit) in enumerate(zip(axes, forces, strict=True)):
-        lines = (
-            Line(time_s[shown], measured_nm[shown, index], "wide", "current × gain"),
-            Line(time_s[shown], predicted_nm[shown, index], "dashed", "model"),
-        )
-        label = f"{name}: {QUANTITY[unit]} [{unit}], error {errors.axes[index]:.1f} %"
-        drawn.append(chart(lines, f"Measured and predicted {QUANTITY[unit]} of {name}", ("time [s]", label)))
+        measured = Line(time_s[shown], measured_nm[shown, index], "wide", "current × gain")
+        predicted = Line(time_s[shown], predicted_nm[shown, index], "dashed", "model")
+        quantity = QUANTITY[unit]
+        label = f"{name}: {quantity} [{unit}], error {errors.axes[index]:.1f} %"
+        title = f"Measured and predicted {quantity} of {name}"
+        drawn.append(chart((measured, predicted), title, ("time [s]", label)))
     return tuple(drawn)
 
 
@@ -109,12 +116,20 @@ def drawn_axis(before: Evidence, after: Evidence, placed: PlacedEffect) -> int:
     """Return the axis of an effect; of one on a joint without a motor, the axis whose residual falls most with it."""
     if placed.axis < after.model.robot.axis_count:
         return placed.axis
-    without, with_it = (
-        np.sum(one.estimate.residual_torque(one.training) ** 2, axis=1, where=one.training.use)
-        for one in (before, after)
-    )
+    without = _squared_residual(before)
+    with_it = _squared_residual(after)
     moved = without > 0.0
-    return int(np.argmax(np.where(moved, without - with_it, 0.0) / np.where(moved, without, 1.0)))
+    fall = np.where(moved, without - with_it, 0.0)
+    share = fall / np.where(moved, without, 1.0)
+    return int(np.argmax(share))
+
+
+def _squared_residual(evidence: Evidence) -> FloatArray:
+    """Sum of the squared residual torque of each axis over the rows of the fit, shape (n,)."""
+    rows = evidence.training
+    residual_nm = evidence.estimate.residual_torque(rows)
+    squared: FloatArray = np.sum(residual_nm**2, axis=1, where=rows.use)
+    return squared
 
 
 def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> tuple[str, ...]:
@@ -122,29 +137,32 @@ def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: C
 
     It is that of `drawn_axis`, against the variable and the velocity of the joint that the effect acts on.
     """
-    index = len(after.fit_runs) if after.held_out else 0
+    index = 0
+    if after.held_out:
+        index = len(after.fit_runs)
     rows_after = _shown_rows(after)
     chosen = rows_after.run == index
     data = after.datasets[index]
-    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.fit_runs))
-    along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
-    variable, velocity = (
-        decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along, seen.velocity_rad_s[placed.axis])
-    )
-    drawn = drawn_axis(before, after, placed)
-    use = rows_after.use[drawn, chosen]
-    residuals = (
-        np.where(use, model.estimate.residual_torque(_shown_rows(model))[drawn, chosen], np.nan)
-        for model in (before, after)
-    )
+    began_s = session_began_s(after.fit_runs)
+    signals = fitted_signals(after.model, data, after.training, after.estimate, began_s)
+    effect = placed.effect
+    along = signals.variable(effect.abscissa, placed.axis, other_axis(effect))
+    velocity_rad_s = signals.velocity_rad_s[placed.axis]
+    columns = np.stack([along, velocity_rad_s])
+    variable, shown_velocity_rad_s = decimate_rows(data, rows_after.conditioning, columns)
+    axis = drawn_axis(before, after, placed)
+    use = rows_after.use[axis, chosen]
+    before_nm = before.estimate.residual_torque(_shown_rows(before))[axis, chosen]
+    after_nm = after.estimate.residual_torque(rows_after)[axis, chosen]
+    unit = cell.place_units[placed.axis]
     return plot_residual(
         rows_after.time_s[chosen],
-        *residuals,
+        np.where(use, before_nm, np.nan),
+        np.where(use, after_nm, np.nan),
         variable=variable,
-        variable_label=variable_label(placed.effect, cell.place_names, cell.place_units[placed.axis].force),
-        velocity_rad_s=velocity,
-        force=cell.axes[drawn].unit.force,
+        variable_label=variable_label(effect, cell.place_names, unit.force),
+        velocity_rad_s=shown_velocity_rad_s,
+        force=cell.axes[axis].unit.force,
     )
 
 
@@ -177,31 +195,46 @@ def plot_residual(
         force: "Nm", or "N" along a prismatic joint.
     """
     drawn = []
-    reach = float(np.nanmax(np.abs(np.concatenate([before_nm, after_nm, [0.0]]))))
+    every_nm = np.concatenate([before_nm, after_nm, [0.0]])
+    reach = float(np.nanmax(np.abs(every_nm)))
     for words, residual_nm in (("without", before_nm), ("with", after_nm)):
         shown = residual_nm[np.isfinite(residual_nm)]
-        rms_nm = float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")
+        rms_nm = float("nan")
+        if len(shown):
+            rms_nm = float(np.sqrt(np.mean(shown**2)))
         label = f"residual {words} the effect [{force}], RMS {rms_nm:.3g}"
         title = f"Residual {QUANTITY[force]} {words} the effect"
-        over_time = chart((Line(time_s, residual_nm, "thin"),), title, ("time [s]", label), reach=reach)
+        curve = Line(time_s, residual_nm, "thin")
+        drawn.append(chart((curve,), title, ("time [s]", label), reach=reach))
         lines = _against(variable, residual_nm, velocity_rad_s)
-        drawn += [over_time, chart(lines, title, (variable_label, f"{words} the effect [{force}]"), reach=reach)]
+        labels = (variable_label, f"{words} the effect [{force}]")
+        drawn.append(chart(lines, title, labels, reach=reach))
     return tuple(drawn)
 
 
 def _against(variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> tuple[Line, ...]:
     """Samples and means over the variable, for either direction of motion."""
     known = np.isfinite(variable) & np.isfinite(residual_nm)
-    clouds, means = [], []
-    directions = (("forwards", velocity_rad_s > 0, "cloud", "line"), ("backwards", velocity_rad_s < 0, "rest", "other"))
-    for name, moving, cloud, line in directions:
-        x, y = variable[known & moving], residual_nm[known & moving]
-        # Stretches of the variable with equally many samples, so that no mean is of a handful of them.
-        bins = np.array_split(np.argsort(x, kind="stable"), _BINS) if len(x) >= _BINS else []
-        clouds.append(Line(x, y, cloud))
-        centres, middle = (np.array([column[part].mean() for part in bins]) for column in (x, y))
-        means.append(Line(centres, middle, line, f"mean {name}"))
-    return (*clouds, *means)
+    forwards = known & (velocity_rad_s > 0)
+    backwards = known & (velocity_rad_s < 0)
+    return (
+        Line(variable[forwards], residual_nm[forwards], "cloud"),
+        Line(variable[backwards], residual_nm[backwards], "rest"),
+        _mean_line(variable[forwards], residual_nm[forwards], "line", "mean forwards"),
+        _mean_line(variable[backwards], residual_nm[backwards], "other", "mean backwards"),
+    )
+
+
+def _mean_line(variable: FloatArray, residual_nm: FloatArray, kind: str, name: str) -> Line:
+    """Mean of each stretch of the variable; empty where there are too few samples."""
+    # Stretches with equally many samples, so that no mean is of a handful of them.
+    stretches = []
+    if len(variable) >= _BINS:
+        order = np.argsort(variable, kind="stable")
+        stretches = np.array_split(order, _BINS)
+    centres = [variable[rows].mean() for rows in stretches]
+    means = [residual_nm[rows].mean() for rows in stretches]
+    return Line(np.array(centres), np.array(means), kind, name)
 
 
 def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...]) -> str:
@@ -212,8 +245,11 @@ def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], ax
     alike = {(rival.effect.name, rival.axis) for rival in rivals}
     rows = []
     for one in findings:
-        kind = "full" if one.passed else "empty"
+        kind = "empty"
+        if one.passed:
+            kind = "full"
         if (one.effect.name, one.axis) in alike:
             kind = "alike"
-        rows.append((f"{axes[one.axis]}: {effect_text(one.effect, axes)}", one.held_out_fall, kind))
+        name = f"{axes[one.axis]}: {effect_text(one.effect, axes)}"
+        rows.append((name, one.held_out_fall, kind))
     return ranking(rows, "Candidates", "squared error that it removes")

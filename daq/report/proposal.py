@@ -143,13 +143,16 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Ta
     judged, _ = judge(changes, known)
     for change in changes:
         found = judged.get(change.axis, NOT_JUDGED)
+        mark = " "
+        if found.significant:
+            mark = "*"
         table.add_row(
             terminal_text(change.axis),
             f"{change.current_gain:.5g}",
             with_deviation(change.new, change.std),
             f"{change.std_percent:.2f}",
             f"{change.change_percent:+.1f}",
-            f"{abs(found.sigmas):.1f} {'*' if found.significant else ' '}",
+            f"{abs(found.sigmas):.1f} {mark}",
             f"{change.nameplate_gain:.5g}",
             f"{change.nameplate_percent:+.1f}",
             terminal_text(change.unit),
@@ -175,23 +178,35 @@ def proposal_report(proposal: Proposal[E], written: Written | None, known: Sprea
                 nameplate=change.nameplate_gain,
             )
         )
+    backup = None
+    if written is not None:
+        backup = str(written.backup)
+    diff = ""
+    if isinstance(edit, FileEdit):
+        diff = edit.diff
     return FileChange.of(
         edit,
         proposal,
         file=edit.place,
         applied=written is not None,
-        backup=None if written is None else str(written.backup),
+        backup=backup,
         changes=changes,
-        diff=edit.diff if isinstance(edit, FileEdit) else "",
+        diff=diff,
     )
 
 
 def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange:
-    edit, cell = proposal.edit, proposal.target.cell
+    edit = proposal.edit
+    cell = proposal.target.cell
     # A calibration restores no record.
-    outcome = {} if written is None else {**_outcome(written), "source": None}
+    outcome = {}
+    if written is not None:
+        outcome = {**_outcome(written), "source": None}
+    name = None
+    if cell is not None:
+        name = cell.name
     return DriveChange.of(
-        cell=None if cell is None else cell.name,
+        cell=name,
         base_sha256=edit.base_sha256,
         base=edit.base,
         applied=written is not None,
@@ -223,30 +238,38 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
 
 def drive_rollback_report(edit: DriveEdit, written: Written | None) -> DriveRollback:
     """Return a rollback of the drives; `written` is None where nothing was written."""
-    outcome = {} if written is None else _outcome(written)
+    outcome = {}
+    if written is not None:
+        outcome = _outcome(written)
+    changes = []
+    for value, write in zip(edit.values, edit.writes, strict=True):
+        restored = RestoredObject(
+            axis=value.axis.name,
+            object=str(value.parameter),
+            old=value.value,
+            new=value.parameter.value(write.word),
+        )
+        changes.append(restored)
     return DriveRollback(
         drives=edit.subject,
         source=str(edit.source),
         restored=written is not None,
-        changes=[
-            RestoredObject(
-                axis=value.axis.name,
-                object=str(value.parameter),
-                old=value.value,
-                new=value.parameter.value(write.word),
-            )
-            for value, write in zip(edit.values, edit.writes, strict=True)
-        ],
+        changes=changes,
         **outcome,
     )
 
 
 def show_file_rollback(written: Written, console: Console) -> None:
     """Print a rollback of the controller's file as a diff and a line."""
-    edit, backup = written.edit, written.backup
+    edit = written.edit
+    backup = written.backup
     _show_diff(terminal_lines(_rollback_diff(edit)), console)
-    replaced = "the file was gone" if backup is None else f"the replaced content is in {backup.name}"
-    source = "" if edit.source is None else edit.source.name
+    replaced = "the file was gone"
+    if backup is not None:
+        replaced = f"the replaced content is in {backup.name}"
+    source = ""
+    if edit.source is not None:
+        source = edit.source.name
     console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
     console.print("Let the controller load the file.")
 
@@ -264,8 +287,10 @@ def file_rollback_report(written: Written, audit: Path | None) -> FileRollback:
 
 def _rollback_diff(edit: Edit) -> str:
     name = terminal_text(Path(edit.subject).name).plain
-    before, after = (content.decode(errors="replace").splitlines() for content in (edit.before or b"", edit.after))
-    return "\n".join(difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1))
+    before = (edit.before or b"").decode(errors="replace").splitlines()
+    after = edit.after.decode(errors="replace").splitlines()
+    diff = difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1)
+    return "\n".join(diff)
 
 
 def _show_diff(diff: str, console: Console) -> None:

@@ -67,7 +67,9 @@ def residual_view(
         yield ""
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    gains = "Drive gains with the effects" if calibration.effects else "Drive gains"
+    gains = "Drive gains"
+    if calibration.effects:
+        gains = "Drive gains with the effects"
     yield gain_table(calibration.gains, title=f"{gains}; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
@@ -112,7 +114,15 @@ class Headline:
     def by_weight(self) -> tuple[str, ...]:
         """Return them in the order in which a screen gets them: what decides on the calibration comes first."""
         first = (self.together, *self.refused, *self.checks[:1], *self.ending)
-        ordered = (*first, *self.checks[1:], *self.effects, *self.explained, *self.judged, *self.gains, *self.to_record)
+        ordered = (
+            *first,
+            *self.checks[1:],
+            *self.effects,
+            *self.explained,
+            *self.judged,
+            *self.gains,
+            *self.to_record,
+        )
         return tuple(sentence for sentence in ordered if sentence)
 
 
@@ -130,14 +140,16 @@ class SentenceScreen:
             width: columns of the terminal; None of a pipe or file, where a sentence is a line.
         """
         left = self.room
-        kept: set[str] = set()
+        fitting: set[str] = set()
         for sentence in self.headline.by_weight():
-            lines = 1 if width is None else break_lines(sentence, width).count("\n") + 1
-            if lines <= left or not kept:
-                kept.add(sentence)
+            lines = 1
+            if width is not None:
+                lines = break_lines(sentence, width).count("\n") + 1
+            if lines <= left or not fitting:
+                fitting.add(sentence)
                 left -= lines
         parts = tuple(self.headline.parts())
-        shown = tuple(part for part in parts if part.text in kept)
+        shown = tuple(part for part in parts if part.text in fitting)
         if len(shown) == len(parts):
             return shown
         more = counted(len(parts) - len(shown), "sentence")
@@ -152,7 +164,9 @@ def effect_sizes(calibration: Calibration) -> Iterator[str]:
     """Name of each effect as in files and commands, its size ± σ, and what these data cannot distinguish from it."""
     for effect in calibration.effects:
         more = len(effect.ambiguity) - _SHOWN_RIVALS
-        rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
+        rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS])
+        if more > 0:
+            rivals += f" and {more} more"
         rivals = f"; not distinguishable from {rivals}" if rivals else ""
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
 
@@ -186,14 +200,20 @@ def searched_steps(fitted: Fit) -> tuple[Step, ...]:
 def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, ...]]:
     """Yield the best named candidates of a turn under CANDIDATE_HEADINGS, the added one among them."""
     for finding in step.ranked(count):
+        probability = UNTESTED
+        if finding.probability is not None:
+            probability = f"{finding.probability:.3f}"
+        verdict = "no"
+        if finding.passed:
+            verdict = "pass"
         yield (
             finding.effect.name,
             fitted.cell.place_names[finding.axis],
-            UNTESTED if finding.probability is None else f"{finding.probability:.3f}",
+            probability,
             f"{100 * finding.folds_better:.0f} %",
             f"{100 * finding.explained:.1f} %",
             f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
-            "pass" if finding.passed else "no",
+            verdict,
         )
 
 
@@ -208,8 +228,9 @@ def declared_sentences(fitted: Fit) -> Iterator[str]:
 def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Say what a turn of the search added, and what it refused and why."""
     places = fitted.cell.place_names
-    for aside in step.set_aside:
-        yield f"Not added: {aside.finding.placed.name_among(places)}: {aside.reason(places)}."
+    for rejected in step.set_aside:
+        name = rejected.finding.placed.name_among(places)
+        yield f"Not added: {name}: {rejected.reason(places)}."
     if step.accepted is None:
         yield "No candidate passes every gate; nothing is added."
     else:
@@ -242,9 +263,9 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
 
 def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> Headline:
     """Return the sentences of `headline` by their subject."""
-    kept = fitted.steps[-1].after.effects
+    in_model = fitted.steps[-1].after.effects
     checks = list(diagnosis_texts(fitted.diagnoses))
-    if any(is_correction(placed) for placed in kept):
+    if any(is_correction(placed) for placed in in_model):
         # Its gains are right, although the cell file is not yet.
         checks.append(
             "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
@@ -253,18 +274,22 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
     found: list[str] = []
     for step, turn in zip(fitted.steps, account.turns, strict=True):
         if step.accepted is not None and turn is not None:
-            added = [placed for placed in turn.added if placed in kept]
+            added = [placed for placed in turn.added if placed in in_model]
             found += [_effect_sentence(fitted, account, turn, placed, step) for placed in added]
     before, _ = _strictest_error(account.total.before)
     after, where = _strictest_error(account.total.after)
     noise_text = _noise_text(account)
-    noise = "" if noise_text == UNKNOWN_NOISE else f" ({noise_text})"
+    noise = f" ({noise_text})"
+    if noise_text == UNKNOWN_NOISE:
+        noise = ""
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
     judged = tuple(verdict_sentences(fitted))
     explained = tuple(_explained_checks(fitted, account))
     to_record = tuple(f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain)
     if not found:
-        none = "No effect is confirmed" if judged else "No structure found"
+        none = "No structure found"
+        if judged:
+            none = "No effect is confirmed"
         together = f"{none}: the error {where} is {after.total:.1f} %{noise}."
         return Headline(tuple(checks), (), together, judged, (), (), explained, to_record, ending)
     change = error_change_text(before.total, after.total)
@@ -274,7 +299,7 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
         together=f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}.",
         judged=judged,
         refused=tuple(_to_be_refused(effects)),
-        gains=(gains_sentence(fitted, account),),  # empty of gains that were held
+        gains=(gains_sentence(fitted, account),),  # empty for fixed gains
         explained=explained,
         to_record=to_record,
         ending=ending,
@@ -300,7 +325,9 @@ def _explained_checks(fitted: Fit, account: Account) -> Iterator[str]:
             after, _ = _strictest_error(account.total.after, place)
             change = error_change_text(before.at(place), after.at(place))
             changes.append(f"the error of the current of {axis} {where} {change}")
-        errors = f": {'; '.join(changes)}" if changes else ""
+        errors = ""
+        if changes:
+            errors = f": {'; '.join(changes)}"
         said = f"CHECK {subject}: {one.found} ({one.name})"
         yield f"Without the effects, the fit said {said}. With them it does not{errors}."
 
@@ -331,7 +358,9 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
 def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     """What was not added and why, what would have been detected, and what the noise and the gears hide."""
     last = fitted.steps[-1]
-    sentences = [sentence for step in fitted.steps for sentence in _set_aside(fitted, step)]
+    sentences: list[str] = []
+    for step in fitted.steps:
+        sentences += _set_aside(fitted, step)
     sentences += [*_choice_sentence(fitted, account), _silence(fitted)]
     sentences += _unconfirmed_skew(account.skew)
     sentences += _refused(fitted)
@@ -353,7 +382,9 @@ def _unconfirmed(account: Account) -> str:
     change = account.holdout_change
     if change is None or change.rise <= 0.0 or change.is_rise:
         return ""
-    size = f" ({change.rise / change.std:.1f} σ)" if change.std else ""
+    size = ""
+    if change.std:
+        size = f" ({change.rise / change.std:.1f} σ)"
     return f", within its noise{size}: the effects are kept, but not confirmed"
 
 
@@ -403,11 +434,11 @@ def _is_notable(change: GainShift, target_percent: float) -> bool:
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
     """Part of σ that comes from the choice of effects, where it is a third of σ or more (σ is then 6 % larger)."""
     parts = zip(fitted.cell.axis_names, account.total.gains, strict=True)
-    shares = [
-        f"{100.0 * part.choice_std / part.after_std:.0f} % of it on {axis}"
-        for axis, part in parts
-        if 3.0 * part.choice_std >= part.after_std > 0.0
-    ]
+    shares = []
+    for axis, part in parts:
+        if 3.0 * part.choice_std >= part.after_std > 0.0:
+            percent = 100.0 * part.choice_std / part.after_std
+            shares.append(f"{percent:.0f} % of it on {axis}")
     if shares:
         listed = ", ".join(shares)
         yield f"σ of the gains includes the choice of the effects (squares add): {listed}.{_open_text(fitted)}"
@@ -418,7 +449,9 @@ def _open_text(fitted: Fit) -> str:
     names = [placed.name_among(fitted.cell.place_names) for placed in fitted.steps[-1].left_open]
     if not names:
         return ""
-    verb = "is" if len(names) == 1 else "are"
+    verb = "are"
+    if len(names) == 1:
+        verb = "is"
     return f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that would move."
 
 
@@ -426,21 +459,22 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
     """Sentences on findings that did not join the model, where the last model still lacks them."""
     axes = fitted.cell.place_names
     last = fitted.steps[-1]
-    for aside in step.set_aside:
-        finding = aside.finding
+    for rejected in step.set_aside:
+        finding = rejected.finding
+        rival = rejected.rival
         axis = finding.placed.axis_name(axes)
-        replaced = aside.rival is not None and aside.rival in last.after.effects
-        if aside.rival is not None and aside.moved and step is last:
+        replaced = rival is not None and rival in last.after.effects
+        if rival is not None and rejected.moved and step is last:
             yield (
                 f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more on "
-                f"{variable_text(aside.rival.effect, axes)}, and was not added: it would move "
-                f"{aside.moved_text(axes)}."
+                f"{variable_text(rival.effect, axes)}, and was not added: it would move "
+                f"{rejected.moved_text(axes)}."
             )
         elif step is last or (replaced and not is_unnamed(finding.effect)):
             yield (
                 f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error of moves left out "
                 f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
-                f"added: {aside.reason(axes)}."
+                f"added: {rejected.reason(axes)}."
             )
 
 
@@ -451,7 +485,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
     axes = fitted.cell.place_names
     last = fitted.steps[-1]
     # Those are reported with the reason already.
-    reported = [aside.finding.placed for aside in last.set_aside]
+    reported = [rejected.finding.placed for rejected in last.set_aside]
     first: dict[int, Finding] = {}
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
@@ -542,12 +576,18 @@ def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
     """State a time skew that instruments confirm; nothing where they do not, or do not exist."""
     if skew is None or not skew.confirmed:
         return
-    side = "after" if skew.seconds > 0.0 else "before"
-    beside = "it is among the effects" if skew.is_in_model else "it was not added to the model"
+    side = "before"
+    if skew.seconds > 0.0:
+        side = "after"
+    standing = "it was not added to the model"
+    if skew.is_in_model:
+        standing = "it is among the effects"
+    delay_ms = 1e3 * abs(skew.seconds)
+    std_ms = 1e3 * skew.std
     yield (
-        f"Currents were sampled {1e3 * abs(skew.seconds):.2f} ± {1e3 * skew.std:.2f} ms {side} the positions, the same "
-        f"on every axis ({beside}). Tenths of a millisecond are a filter of the drive, several milliseconds a fault of "
-        "the recording: check its stamps."
+        f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same "
+        f"on every axis ({standing}). Tenths of a millisecond are a filter of the drive, several milliseconds "
+        "a fault of the recording: check its stamps."
     )
 
 
@@ -613,7 +653,8 @@ def error_rows(account: Account) -> dict[str, RelativeError]:
     rows["noise, estimate, held out"] = account.holdout_floor
     rows["noise, at least"] = account.least_floor
     rows["noise, at least, held out"] = account.least_holdout_floor
-    return {name: error for name, error in rows.items() if error is not None and any(map(math.isfinite, error.axes))}
+    measured = {name: error for name, error in rows.items() if error is not None}
+    return {name: error for name, error in measured.items() if any(map(math.isfinite, error.axes))}
 
 
 def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[RelativeError, str]:
@@ -632,10 +673,13 @@ def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[
 
 def error_change_text(before_percent: float, after_percent: float) -> str:
     """Describe the change of an error: `falls from 6.9 to 2.8 %`, `falls slightly, from 2.4 to 2.3 %`."""
-    before, after = f"{before_percent:.1f}", f"{after_percent:.1f}"
+    before = f"{before_percent:.1f}"
+    after = f"{after_percent:.1f}"
     if before == after:
         return f"stays at {after} %"
-    change = "rises" if after_percent > before_percent else "falls"
+    change = "falls"
+    if after_percent > before_percent:
+        change = "rises"
     if before_percent * (1.0 - SLIGHT) < after_percent < before_percent:
         change += " slightly,"
     return f"{change} from {before} to {after} %"
@@ -647,11 +691,15 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
     what = effect_text(placed.effect, axes)
     if doubt := doubted_name(step, placed, axes):
         what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
-    place = placed.axis if placed.effect.has_axis else None
+    place = None
+    if placed.effect.has_axis:
+        place = placed.axis
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
     if is_correction(placed):  # it is judged by all motors together
-        subject = name if placed.effect.has_axis else "The recording"
+        subject = "The recording"
+        if placed.effect.has_axis:
+            subject = name
         if f"{before.total:.1f}" == f"{after.total:.1f}":
             return f"{subject} has {what}{_hardly_shown_text(fitted, placed, step, before, after, where)}."
         change = error_change_text(before.total, after.total)
@@ -664,7 +712,9 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
         what += f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
     if without * (1.0 - SLIGHT) < with_it <= without:
         what += ", a small effect"
-    whose = name if placed.axis < len(fitted.cell.axes) else "all axes"
+    whose = "all axes"
+    if placed.axis < len(fitted.cell.axes):
+        whose = name
     noise = _noise_text(account, placed.axis)
     return f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} ({noise})."
 
@@ -676,13 +726,17 @@ def _hardly_shown_text(
     final = fitted.steps[-1].after
     sizes = coefficients(final if placed in final.effects else step.after, placed)
     sigmas = math.hypot(*(one.value / one.std for one in sizes if one.std > 0.0))
-    certain = f", by {sigmas:.0f} σ" if sigmas else ""
+    certain = ""
+    if sigmas:
+        certain = f", by {sigmas:.0f} σ"
     text = (
         f"{certain}: it hardly shows in the error of all axes {where}, {before.total:.2f} % without it and "
         f"{after.total:.2f} % with it"
     )
     names = fitted.cell.axis_names
-    falls = {name: 1.0 - last / first for name, first, last in zip(names, before.axes, after.axes, strict=True)}
+    falls = {}
+    for name, first, last in zip(names, before.axes, after.axes, strict=True):
+        falls[name] = 1.0 - last / first
     falls = {name: fall for name, fall in falls.items() if fall > 0.0}
     if not falls:
         return text
@@ -714,10 +768,14 @@ def _noise_text(account: Account, place: int | None = None) -> str:
     if account.least_holdout_floor is not None and account.holdout_floor is not None:
         least = account.least_holdout_floor
         estimate = account.holdout_floor
-    least_percent = least.total if place is None else least.at(place)
+    least_percent = least.total
+    if place is not None:
+        least_percent = least.at(place)
     if math.isfinite(least_percent):
         return f"noise leaves at least {least_percent:.1f} %"
-    percent = estimate.total if place is None else estimate.at(place)
+    percent = estimate.total
+    if place is not None:
+        percent = estimate.at(place)
     if math.isfinite(percent):
         return f"noise leaves {percent:.1f} %, an estimate"
     return UNKNOWN_NOISE
@@ -733,14 +791,18 @@ def _silence(fitted: Fit) -> str:
             f"The search ended after {MAX_EFFECTS} effects with more to find: check the declared model first "
             "(drive train, payload, channels)."
         )
-    limits = ", ".join(
-        f"{limit:.2g} {axis.unit.force} on {axis.name}"
-        for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
-    )
-    ended = f"The search ended early: {last.ended}. " if last.ended else ""
+    axis_limits = []
+    for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True):
+        axis_limits.append(f"{limit:.2g} {axis.unit.force} on {axis.name}")
+    limits = ", ".join(axis_limits)
+    ended = ""
+    if last.ended:
+        ended = f"The search ended early: {last.ended}. "
     trained = last.after.fit_runs
     clockless = len(trained) > 1 and session_began_s(trained) is None
-    unseen = " The runs have no common clock: a warm-up over the session cannot be seen." if clockless else ""
+    unseen = ""
+    if clockless:
+        unseen = " The runs have no common clock: a warm-up over the session cannot be seen."
     return (
         f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean square in motion: "
         f"{limits}.{unseen}"

@@ -247,7 +247,21 @@ _METRIC = (
 
 def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
     """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
-    axes, last = fitted.cell.axis_names, fitted.steps[-1]
+    axes = fitted.cell.axis_names
+    last = fitted.steps[-1]
+    confirmed_skew = None
+    if account.skew is not None and account.skew.confirmed:
+        confirmed_skew = account.skew
+    worse_holdout = None
+    if account.holdout_change is not None:
+        worse_holdout = account.holdout_change.is_rise
+    gear_loss = []
+    for axis, gear in zip(axes, gear_losses(last), strict=True):
+        gear_loss.append(GearLossEntry.of(gear, axis=axis))
+    turns = []
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        turns.append(_turn(fitted, step, turn))
+    places = fitted.cell.place_names
     return with_calibration(
         ResidualReport,
         calibration,
@@ -255,22 +269,28 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
         axes=axes,
         metric=_METRIC,
         noise_floor=_noise_floor(account, axes),
-        time_skew=account.skew if account.skew is not None and account.skew.confirmed else None,
+        time_skew=confirmed_skew,
         time_skew_by_instruments=account.skew,
-        gear_loss=[GearLossEntry.of(gear, axis=axis) for axis, gear in zip(axes, gear_losses(last), strict=True)],
+        gear_loss=gear_loss,
         before=_model_errors(account.total.before),
         after=_model_errors(account.total.after),
         gain_changes=_changed_gains(fitted, account.total),
-        worse_holdout=None if account.holdout_change is None else account.holdout_change.is_rise,
-        verdicts=[_verdict(verdict, fitted.cell.place_names) for verdict in last.verdicts],
-        turns=[_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
+        worse_holdout=worse_holdout,
+        verdicts=[_verdict(verdict, places) for verdict in last.verdicts],
+        turns=turns,
     )
 
 
 def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
     floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
+    motors = []
+    for axis, floor, left_a in floors:
+        noise = None
+        if floor is not None:
+            noise = _motor_noise(axis, floor, left_a)
+        motors.append(noise)
     return NoiseFloor.of(
-        motors=[None if floor is None else _motor_noise(axis, floor, left_a) for axis, floor, left_a in floors],
+        motors=motors,
         relative_error_percent=account.floor,
         holdout_error_percent=account.holdout_floor,
         least_error_percent=account.least_floor,
@@ -298,25 +318,36 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
     limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
     changes: dict[str, Any] = {"added": [], "removed": []}
     if turn is not None:
+        added = []
+        for placed in turn.added:
+            sizes = coefficients(step.after, placed)
+            added.append(_named(PlacedEffectEntry, placed, axes, coefficients=sizes))
         changes = {
-            "added": [
-                _named(PlacedEffectEntry, placed, axes, coefficients=coefficients(step.after, placed))
-                for placed in turn.added
-            ],
+            "added": added,
             "removed": [placed.name_among(axes) for placed in turn.removed],
             "before": _model_errors(turn.before),
             "after": _model_errors(turn.after),
             "gain_changes": _changed_gains(fitted, turn),
         }
+    accepted = None
+    if step.accepted is not None:
+        accepted = _finding(step.accepted, axes)
+    names = names_by_split(step)
+    split_names = [_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names]
+    set_aside = []
+    for rejected in step.set_aside:
+        finding = _finding(rejected.finding, axes)
+        set_aside.append(AsideEntry.of(finding, reason=rejected.reason(axes)))
+    detection_limits = [DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits]
     return TurnEntry.of(
         None,
         **changes,
-        accepted=None if step.accepted is None else _finding(step.accepted, axes),
-        names_by_split=[_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names_by_split(step)],
+        accepted=accepted,
+        names_by_split=split_names,
         findings=[_finding(finding, axes) for finding in step.findings],
         structures=[_finding(finding, axes) for finding in step.structures],
-        set_aside=[AsideEntry.of(_finding(aside.finding, axes), reason=aside.reason(axes)) for aside in step.set_aside],
-        detection_limits=[DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits],
+        set_aside=set_aside,
+        detection_limits=detection_limits,
     )
 
 
@@ -328,11 +359,11 @@ def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
 def _model_errors(errors: RelativeErrors) -> ModelErrors:
     left_out = None
     if errors.left_out_runs is not None:
-        runs = errors.left_out_runs.runs
-        left_out = LeftOutRuns.of(
-            error_percent=errors.left_out_runs.together,
-            runs=[LeftOutRun.of(run, error_percent=run.error, reason=run.reason or None) for run in runs],
-        )
+        runs = []
+        for run in errors.left_out_runs.runs:
+            reason = run.reason or None
+            runs.append(LeftOutRun.of(run, error_percent=run.error, reason=reason))
+        left_out = LeftOutRuns.of(error_percent=errors.left_out_runs.together, runs=runs)
     return ModelErrors.of(
         relative_error_percent=errors.in_sample,
         cross_validated_error_percent=errors.cross_validated,
@@ -361,15 +392,19 @@ def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
 
 def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
     sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
+    found = []
+    for column, value, std in sizes:
+        found.append(Coefficient.of(name=column.name, value=value, std=std, unit=column.unit))
+    # For findings that failed a gate it would be most of the file and of no use.
+    ambiguity = None
+    if finding.passed:
+        ambiguity = [rival.name_among(axes) for rival in finding.ambiguity]
     return _named(
         FindingEntry,
         finding.placed,
         axes,
         finding,
         variable=finding.effect.abscissa,
-        coefficients=[
-            Coefficient.of(name=column.name, value=value, std=std, unit=column.unit) for column, value, std in sizes
-        ],
-        # For findings that failed a gate it would be most of the file and of no use.
-        ambiguity=[rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
+        coefficients=found,
+        ambiguity=ambiguity,
     )

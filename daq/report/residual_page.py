@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
+from daq.config.cell import Cell
 from daq.errors import writing
 from daq.files import replace_file
 from daq.ledger.ledger import Standing
@@ -45,8 +47,10 @@ from ident.discovery.loop import Step
 from ident.effects.effect import PlacedEffect
 from ident.effects.unnamed import is_unnamed
 
-PAGE, DOCUMENT = "report.html", "residual.json"
-FORMAT, VERSION = "drivegain-residual", 1
+PAGE = "report.html"
+DOCUMENT = "residual.json"
+FORMAT = "drivegain-residual"
+VERSION = 1
 MARKS = {PAGE: MARK, DOCUMENT: f'"format": "{FORMAT}"'}
 """Text at the beginning of each file of a report, by which an earlier report is recognised."""
 _SHOWN = 10  #: Candidates of a turn that are drawn; residual.json has them all
@@ -60,7 +64,7 @@ def save_report(
     comparison: Comparison | None = None,
     session: str | None = None,
 ) -> None:
-    """Write report.html and residual.json, each whole or not at all; without a comparison, beside the nameplate.
+    """Write report.html and residual.json, each completely or not at all; without a comparison, with the nameplate's.
 
     Args:
         fitted, account: the fit with its effects, and what they changed.
@@ -74,11 +78,13 @@ def save_report(
     """
     body = residual_report(fitted, account, calibration)
     # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
-    document = ResidualFile.model_validate({"format": FORMAT, "version": VERSION, **dict(body)}, strict=False)
-    content = {PAGE: residual_page(fitted, account, calibration, comparison, session), DOCUMENT: json_text(document)}
+    fields = {"format": FORMAT, "version": VERSION, **dict(body)}
+    document = ResidualFile.model_validate(fields, strict=False)
+    page = residual_page(fitted, account, calibration, comparison, session)
+    text = json_text(document)
     with writing(folder):
-        for name, text in content.items():
-            replace_file(folder / name, text.encode())
+        replace_file(folder / PAGE, page.encode())
+        replace_file(folder / DOCUMENT, text.encode())
 
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
@@ -108,7 +114,7 @@ def residual_page(
 
 @dataclass(frozen=True, slots=True)
 class PageDetails:
-    """What a page shows of a closed loop, beside what is in the calibration."""
+    """What a page shows of a closed loop, in addition to the calibration."""
 
     consequence: str  #: what the effects change in the gains, a sentence
     sections: tuple[str, ...]  #: folded sections, HTML
@@ -116,78 +122,114 @@ class PageDetails:
 
 def page_details(fitted: Fit, account: Account, calibration: Calibration) -> PageDetails:
     """Return the account of a closed loop's turns for its page; see `save_report`."""
-    axes = fitted.cell.axis_names
-    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account).items()]
-    sections = []
+    effects = []
     before = start_of(fitted)
     for step, turn in zip(fitted.steps, account.turns, strict=True):
         if turn is not None:
-            sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
+            effects += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
-    sentences = (*declared_sentences(fitted), *summary(fitted, account, calibration.effects))
-    folded_sections = (
+    sentences = [*declared_sentences(fitted), *summary(fitted, account, calibration.effects)]
+    names = html_list(effect_sizes(calibration))
+    turns = []
+    for number, step in enumerate(searched_steps(fitted), start=1):
+        turns.append(_turn(fitted, number, step))
+    sections = (
         folded("What was found, in sentences", html_list(sentences)),
-        folded(
-            "Errors without and with the effects",
-            table("Relative error of the motor currents [%]", ("", *axes, "total"), errors, "names"),
-            paragraph(
-                "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
-                "in total with each current weighted by its gain. Compare errors only under the same filters (end "
-                "of this page). Noise, estimate: what the current's noise alone would leave, as measured at standstill "
-                "or between repeated moves, whichever is smaller, and at most the error. Noise, at least: its lower "
-                "limit at 95 % confidence, where moves were repeated: in 19 of 20 cases no model's error is smaller."
-            ),
-        ),
-        *sections,
-        folded(
-            "Measured and predicted torques",
-            paragraph("Gaps: samples left out, most of them at standstill."),
-            pair(map(figure, draw_torques(before, fitted.cell))),
-        ),
+        _errors(fitted, account),
+        *effects,
+        _torques(before, fitted.cell),
         _gains(fitted, account),
-        folded("Effects by their names in files and commands", html_list(effect_sizes(calibration))),
-        *(_turn(fitted, number, step) for number, step in enumerate(searched_steps(fitted), start=1)),
+        folded("Effects by their names in files and commands", names),
+        *turns,
         _limits(fitted, calibration),
     )
-    return PageDetails(gains_sentence(fitted, account), folded_sections)
+    return PageDetails(gains_sentence(fitted, account), sections)
+
+
+def _errors(fitted: Fit, account: Account) -> str:
+    headings = ("", *fitted.cell.axis_names, "total")
+    rows = []
+    for name, error in error_rows(account).items():
+        cells = map(percent_text, (*error.axes, error.total))
+        rows.append((name, *cells))
+    explanation = (
+        "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
+        "in total with each current weighted by its gain. Compare errors only under the same filters (end "
+        "of this page). Noise, estimate: what the current's noise alone would leave, as measured at standstill "
+        "or between repeated moves, whichever is smaller, and at most the error. Noise, at least: its lower "
+        "limit at 95 % confidence, where moves were repeated: in 19 of 20 cases no model's error is smaller."
+    )
+    return folded(
+        "Errors without and with the effects",
+        table("Relative error of the motor currents [%]", headings, rows, "names"),
+        paragraph(explanation),
+    )
+
+
+def _torques(final: Evidence, cell: Cell) -> str:
+    drawings = draw_torques(final, cell)
+    return folded(
+        "Measured and predicted torques",
+        paragraph("Gaps: samples left out, most of them at standstill."),
+        pair(map(figure, drawings)),
+    )
 
 
 def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
     axes = fitted.cell.place_names
-    axis, final = axes[placed.axis], fitted.steps[-1].after
+    axis = axes[placed.axis]
+    final = fitted.steps[-1].after
     has_motor = placed.axis < len(fitted.cell.axes)
     shown_axis = axes[drawn_axis(before, step.after, placed)]
-    of_joint = "" if has_motor else f" of {axis}"
-    kept = placed in final.effects
+    of_joint = f" of {axis}"
+    error_of = "all axes"
+    if has_motor:
+        of_joint = ""
+        error_of = axis
+    is_in_model = placed in final.effects
     sentences = [f"Name in files and commands: `{placed.name_among(axes)}`."]
-    if doubt := doubted_name(step, placed, axes):
+    doubt = doubted_name(step, placed, axes)
+    if doubt:
         sentences.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
     if step.accepted is not None and step.accepted.ambiguity:
         rivals = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in step.accepted.ambiguity)
         sentences.append(f"These data cannot distinguish it from: {rivals}.")
     else:
         sentences.append("Every other candidate is clearly worse.")
-    if not kept:
+    if not is_in_model:
         sentences.append("A later round removed it again, because it no longer reduced the error.")
     before_by_data = errors_by_data(turn.before)
     after_by_data = errors_by_data(turn.after)
     errors = []
     for data in ("fit", "moves left out", "held out"):
-        first, second = before_by_data[data], after_by_data[data]
+        first = before_by_data[data]
+        second = after_by_data[data]
         if first is not None and second is not None:
-            errors.append((data, percent_text(first.at(placed.axis)), percent_text(second.at(placed.axis))))
+            without = percent_text(first.at(placed.axis))
+            with_it = percent_text(second.at(placed.axis))
+            errors.append((data, without, with_it))
     # The coefficients of a term without a name mean nothing one by one; the certificate draws its curve.
-    sizes = [] if is_unnamed(placed.effect) else value_rows(coefficients(final if kept else step.after, placed))
+    model = step.after
+    if is_in_model:
+        model = final
+    sizes = ""
+    if not is_unnamed(placed.effect):
+        rows = value_rows(coefficients(model, placed))
+        if rows:
+            sizes = table("Identified coefficients", ("coefficient", "value ± σ", "unit"), rows)
+    drawings = draw_effect(before, step.after, placed, fitted.cell)
+    variable = f"{variable_text(placed.effect, axes)}{of_joint}"
+    explanation = (
+        f"Residual of {shown_axis} over time and against {variable}, without "
+        "and with the effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
+    )
     return folded(
         f"{axis}: {effect_text(placed.effect, axes)}",
         paragraph(" ".join(sentences)),
-        table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes) if sizes else "",
-        table(f"Relative error of {axis if has_motor else 'all axes'} [%]", ("", *WHEN), errors),
-        pair(map(figure, draw_effect(before, step.after, placed, fitted.cell))),
-        paragraph(
-            f"Residual of {shown_axis} over time and against {variable_text(placed.effect, axes)}{of_joint}, without "
-            "and with the effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
-        ),
+        sizes,
+        table(f"Relative error of {error_of} [%]", ("", *WHEN), errors),
+        pair(map(figure, drawings)),
+        paragraph(explanation),
     )
 
 
@@ -199,28 +241,30 @@ def _gains(fitted: Fit, account: Account) -> str:
     for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):
         percent = change.change_percent
         std_percent = change.change_std_percent
-        rows.append(
-            (
-                axis.name,
-                with_deviation(change.before, change.before_std),
-                f"{with_deviation(change.after, change.after_std)} {axis.gain_unit}",
-                f"{percent:+.2f} ± {std_percent:.2f}",
-                "more than noise" if change.significant else "within noise",
-            )
-        )
-        shifts.append(Interval(axis.name, percent, 2.0 * std_percent, -math.inf, math.inf, f"{percent:+.2f} %"))
+        before = with_deviation(change.before, change.before_std)
+        after = with_deviation(change.after, change.after_std)
+        verdict = "within noise"
+        if change.significant:
+            verdict = "more than noise"
+        change_text = f"{percent:+.2f} ± {std_percent:.2f}"
+        rows.append((axis.name, before, f"{after} {axis.gain_unit}", change_text, verdict))
+        label = f"{percent:+.2f} %"
+        shifts.append(Interval(axis.name, percent, 2.0 * std_percent, -math.inf, math.inf, label))
+    drawing = intervals(shifts, "Change of each gain by the effects", "change by the effects [%]")
+    caption = "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both estimates share in part."
     return folded(
         "Gains without and with the effects",
         table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
-        figure(
-            intervals(shifts, "Change of each gain by the effects", "change by the effects [%]"),
-            "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both estimates share in part.",
-        ),
+        figure(drawing, caption),
     )
 
 
 def _turn(fitted: Fit, number: int, step: Step) -> str:
-    axes, added = fitted.cell.place_names, step.accepted
+    axes = fitted.cell.place_names
+    added = step.accepted
+    rivals: Sequence[PlacedEffect] = ()
+    if added is not None:
+        rivals = added.ambiguity
     named = step.ranked(_SHOWN)
     own = [one.placed for one in named]
     structures = [one for one in step.structures[:_SHOWN] if one.passed and one.placed not in own]
@@ -228,23 +272,25 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
-        ranking = figure(
-            plot_ranking(ranked, () if added is None else added.ambiguity, axes),
+        caption = (
             "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
             "data cannot distinguish it from the added one. Hollow: failed a check. The scale counts the squared "
-            "noise of one sample as 1.",
+            "noise of one sample as 1."
         )
-    in_words = [
-        f"Not added to {axes[aside.finding.axis]}: {effect_text(aside.finding.effect, axes)}: {aside.reason(axes)}."
-        for aside in step.set_aside
-    ]
+        ranking = figure(plot_ranking(ranked, rivals, axes), caption)
+    sentences = list(turn_sentences(fitted, step))
+    for rejected in step.set_aside:
+        finding = rejected.finding
+        name = effect_text(finding.effect, axes)
+        sentences.append(f"Not added to {axes[finding.axis]}: {name}: {rejected.reason(axes)}.")
     if added is not None:
-        in_words.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
+        sentences.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
+    rows = candidate_rows(fitted, step, _SHOWN)
     return folded(
         f"Search, turn {number}: what was tried",
-        html_list((*turn_sentences(fitted, step), *in_words)),
+        html_list(sentences),
         ranking,
-        table(f"Turn {number}: {CANDIDATES}", CANDIDATE_HEADINGS, candidate_rows(fitted, step, _SHOWN), "names"),
+        table(f"Turn {number}: {CANDIDATES}", CANDIDATE_HEADINGS, rows, "names"),
     )
 
 

@@ -18,9 +18,16 @@ import numpy as np
 from daq.report.html import DRAWING, LIGHT, spelled
 from ident.arrays import FloatArray
 
-_WIDTH, _ROW, _TOP, _FOOT = 360.0, 25.0, 6.0, 36.0
-_LEFT, _RIGHT = 46.0, 96.0  #: Room for the names and for the numbers
-_LETTER, _LONGEST = 8.5, 170.0  #: Width of a letter of a name, and of a name at most
+_WIDTH = 360.0
+_ROW = 25.0
+_TOP = 6.0
+_FOOT = 36.0
+#: Room for the names and for the numbers
+_LEFT = 46.0
+_RIGHT = 96.0
+#: Width of a letter of a name, and of a name at most
+_LETTER = 8.5
+_LONGEST = 170.0
 _ROOM = 1.12  #: Length of a scale over the largest value on it
 
 
@@ -33,7 +40,7 @@ class Interval:
     half: float  #: half of its interval
     lower: float  #: limits of the value; infinite without one
     upper: float
-    label: str  #: the value in words, beside the row
+    label: str  #: the value in words, to the right of the row
 
 
 def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
@@ -43,38 +50,64 @@ def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     both ends say that the limits are beyond.
     """
     reach = _largest(abs(row.value) + row.half for row in rows)
-    bounds = _largest([abs(bound) for r in rows for bound in (r.lower, r.upper)])
-    to_scale = bounds == 0.0 or reach >= 0.1 * bounds
+    lowest_bound = _largest(abs(row.lower) for row in rows)
+    highest_bound = _largest(abs(row.upper) for row in rows)
+    bounds = max(lowest_bound, highest_bound)
+    shows_limits = bounds == 0.0 or reach >= 0.1 * bounds
     # Below 0.1 a scale would only magnify noise.
-    extent = _ROOM * max(reach, bounds if to_scale else 0.0, 0.1)
-    scale = _Scale(-extent, extent, len(rows), _room(row.name for row in rows))
-    parts = [*scale.frame(unit), _line(scale.x(0.0), _TOP, scale.x(0.0), scale.bottom, "zero")]
+    largest = max(reach, 0.1)
+    if shows_limits:
+        largest = max(largest, bounds)
+    extent = _ROOM * largest
+    left = _room(row.name for row in rows)
+    scale = _Scale(-extent, extent, len(rows), left)
+    zero = scale.x(0.0)
+    parts = [*scale.frame(unit), _line(zero, _TOP, zero, scale.bottom, "zero")]
     for number, row in enumerate(rows):
         y = scale.y(number)
-        low, high = (scale.x(min(max(bound, -extent), extent)) for bound in (row.lower, row.upper))
         if bounds > 0.0:
-            parts.insert(0, f'<rect class="range" x="{low:.1f}" y="{y - 9:.1f}" width="{high - low:.1f}" height="18"/>')
-        parts += [
-            _line(scale.x(bound), y - 9, scale.x(bound), y + 9, "limit")
-            for bound in (row.lower, row.upper)
-            if abs(bound) <= extent
-        ]
-        if math.isfinite(row.value):
-            parts.append(_line(scale.x(row.value - row.half), y, scale.x(row.value + row.half), y, "bar"))
-            parts.append(_dot(scale.x(row.value), y, "dot"))
-        parts += [_name(y + 4, row.name), _text(_WIDTH, y + 4, row.label, "end")]
-    if not to_scale:
-        parts += [
-            _text(scale.left, scale.bottom + 47, "◂ limit", "soft"),
-            _text(scale.right, scale.bottom + 47, "limit ▸", "soft end"),
-        ]
-    return _drawing(parts, title, scale.bottom + _FOOT + (0.0 if to_scale else 17.0))
+            # Behind everything else.
+            parts.insert(0, _range(row, scale, y))
+        parts += _interval_marks(row, scale, y)
+        parts.append(_name(y + 4, row.name))
+        parts.append(_text(_WIDTH, y + 4, row.label, "end"))
+    height = scale.bottom + _FOOT
+    if not shows_limits:
+        height += 17.0
+        below = scale.bottom + 47
+        parts.append(_text(scale.left, below, "◂ limit", "soft"))
+        parts.append(_text(scale.right, below, "limit ▸", "soft end"))
+    return _drawing(parts, title, height)
+
+
+def _range(row: Interval, scale: _Scale, y: float) -> str:
+    """Draw what the limits of a row allow, as far as the scale shows it."""
+    low = scale.x(scale.clipped(row.lower))
+    high = scale.x(scale.clipped(row.upper))
+    width = high - low
+    return f'<rect class="range" x="{low:.1f}" y="{y - 9:.1f}" width="{width:.1f}" height="18"/>'
+
+
+def _interval_marks(row: Interval, scale: _Scale, y: float) -> Iterator[str]:
+    """Draw the limits of a row that are on the scale, and its value with its interval."""
+    for bound in (row.lower, row.upper):
+        if abs(bound) <= scale.high:
+            x = scale.x(bound)
+            yield _line(x, y - 9, x, y + 9, "limit")
+    if math.isfinite(row.value):
+        begin = scale.x(row.value - row.half)
+        end = scale.x(row.value + row.half)
+        yield _line(begin, y, end, y, "bar")
+        yield _dot(scale.x(row.value), y, "dot")
 
 
 def before_after_drawing(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
     """Draw each value before (hollow) and after (full), from zero; NaN for one that is not known."""
-    most = _ROOM * max(_largest([v for _, *both in rows for v in both]), 1e-9)
-    scale = _Scale(0.0, most, len(rows), _room(name for name, *_ in rows))
+    most_before = _largest(before for _, before, _ in rows)
+    most_after = _largest(after for _, _, after in rows)
+    most = _ROOM * max(most_before, most_after, 1e-9)
+    left = _room(name for name, _, _ in rows)
+    scale = _Scale(0.0, most, len(rows), left)
     parts = list(scale.frame(unit))
     for number, (name, before, after) in enumerate(rows):
         y = scale.y(number)
@@ -86,7 +119,8 @@ def before_after_drawing(rows: Sequence[tuple[str, float, float]], title: str, u
         if math.isfinite(after):
             parts.append(_dot(scale.x(after), y, "dot"))
         label = " → ".join(f"{value:.2f}" for value in known) or "-"
-        parts += [_name(y + 4, name), _text(_WIDTH, y + 4, label, "end")]
+        parts.append(_name(y + 4, name))
+        parts.append(_text(_WIDTH, y + 4, label, "end"))
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
@@ -124,40 +158,65 @@ def chart(
     values.append(np.array([0.0, reach, -reach]))
     low, high = _ends(values)
     begin, end = _ends([line.x for line in lines])
-    across, left, top, height = _WIDTH - 8.0, 50.0, 22.0, 150.0
+    across = _WIDTH - 8.0
+    left = 50.0
+    top = 22.0
+    height = 150.0
 
     def right(x: FloatArray) -> FloatArray:
-        return left + (x - begin) / (end - begin) * (across - left)
+        share = (x - begin) / (end - begin)
+        return left + share * (across - left)
 
     def down(y: FloatArray) -> FloatArray:
-        return top + (high - y) / (high - low) * (height - top)
+        share = (high - y) / (high - low)
+        return top + share * (height - top)
 
     parts = []
     for tick in _ticks(low, high):
         y = float(down(np.array(tick)))
-        parts.append(_line(left, y, across, y, "zero" if tick == 0.0 else "grid"))
+        kind = "grid"
+        if tick == 0.0:
+            kind = "zero"
+        parts.append(_line(left, y, across, y, kind))
         parts.append(_text(left - 5, y + 4, f"{tick:g}", "soft end"))
-    parts.extend(
-        _text(float(right(np.array(tick))), height + 17, f"{tick:g}", "soft mid") for tick in _ticks(begin, end)
-    )
+    for tick in _ticks(begin, end):
+        x = float(right(np.array(tick)))
+        parts.append(_text(x, height + 17, f"{tick:g}", "soft mid"))
     if half is not None:
-        xs = np.concatenate([first.x, first.x[::-1]])
-        ys = np.concatenate([first.y + half, (first.y - half)[::-1]])
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(right(xs).tolist(), down(ys).tolist(), strict=True))
-        parts.append(f'<polygon class="band" points="{points}"/>')
+        upper = down(first.y + half)
+        lower = down(first.y - half)
+        parts.append(_band(right(first.x), lower, upper))
     for line in lines:
-        draw = _points if line.kind in _CLOUDS else _curve
-        parts.append(f'<path class="{line.kind}" d="{draw(right(line.x), down(line.y))}"/>')
-    parts += [_text(0, 13, labels[1], "soft"), _text(across, height + 36, labels[0], "soft end")]
+        draw = _curve
+        if line.kind in _CLOUDS:
+            draw = _points
+        path = draw(right(line.x), down(line.y))
+        parts.append(f'<path class="{line.kind}" d="{path}"/>')
+    label_x, label_y = labels
+    parts.append(_text(0, 13, label_y, "soft"))
+    parts.append(_text(across, height + 36, label_x, "soft end"))
     named = [line for line in lines if line.name]
-    bottom = height + (60 if named else 42)
+    bottom = height + 42
+    if named:
+        bottom = height + 60
     at = left
     for line in named:
-        length = 0 if line.kind in _CLOUDS else 22
-        sample = f"M{at:.0f} {bottom - 10:.0f}h{length}"
-        parts += [f'<path class="{line.kind}" d="{sample}"/>', _text(at + 28, bottom - 6, line.name, "soft")]
+        length = 22
+        if line.kind in _CLOUDS:
+            length = 0
+        parts.append(f'<path class="{line.kind}" d="M{at:.0f} {bottom - 10:.0f}h{length}"/>')
+        parts.append(_text(at + 28, bottom - 6, line.name, "soft"))
         at += 40 + 7.5 * len(line.name)
     return _drawing(parts, title, bottom)
+
+
+def _band(x: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
+    """Draw the area between two curves over the same places."""
+    xs = np.concatenate([x, x[::-1]])
+    ys = np.concatenate([upper, lower[::-1]])
+    corners = zip(xs.tolist(), ys.tolist(), strict=True)
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+    return f'<polygon class="band" points="{points}"/>'
 
 
 def _ends(columns: Iterable[FloatArray]) -> tuple[float, float]:
@@ -166,8 +225,11 @@ def _ends(columns: Iterable[FloatArray]) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0
-    low, high = float(known.min()), float(known.max())
-    return low, high if high > low else low + 1.0
+    low = float(known.min())
+    high = float(known.max())
+    if high == low:
+        high = low + 1.0
+    return low, high
 
 
 _CLOUDS = frozenset({"cloud", "rest"})  #: Kinds of lines that are points
@@ -175,29 +237,34 @@ _STRETCHES = 2 * round(_WIDTH)  #: Two a unit of the drawing's width, the dots o
 
 
 def visible_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Keep lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
+    """Select lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
 
     Args:
         x, y: shape (k,), NaN in y leaves a gap.
     """
     if len(x) <= 2 * _STRETCHES:
         return x, y
-    kept = []
+    selected: list[int] = []
     for part in np.array_split(np.arange(len(x)), _STRETCHES):
         values = y[part]
         gap = np.flatnonzero(~np.isfinite(values))
-        if len(gap) < len(part):
-            kept += sorted({int(part[np.nanargmin(values)]), int(part[np.nanargmax(values)]), *part[gap[:1]].tolist()})
-        else:
-            kept.append(int(part[0]))
-    return x[kept], y[kept]
+        if len(gap) == len(part):
+            selected.append(int(part[0]))
+            continue
+        lowest = int(part[np.nanargmin(values)])
+        highest = int(part[np.nanargmax(values)])
+        first_gap = part[gap[:1]].tolist()
+        selected += sorted({lowest, highest, *first_gap})
+    return x[selected], y[selected]
 
 
 def _curve(x: FloatArray, y: FloatArray) -> str:
-    steps, pen = [], "M"
-    for a, b in zip(*(column.tolist() for column in visible_points(x, y)), strict=True):
-        if math.isfinite(b):
-            steps.append(f"{pen}{a:.1f} {b:.1f}")
+    steps = []
+    pen = "M"
+    x, y = visible_points(x, y)
+    for right, down in zip(x.tolist(), y.tolist(), strict=True):
+        if math.isfinite(down):
+            steps.append(f"{pen}{right:.1f} {down:.1f}")
             pen = "L"
         else:
             pen = "M"
@@ -206,16 +273,22 @@ def _curve(x: FloatArray, y: FloatArray) -> str:
 
 def _points(x: FloatArray, y: FloatArray) -> str:
     """Points as strokes of no length; those that fall on one place are drawn once."""
-    places = np.unique(np.round(np.stack([x, y], axis=1)[np.isfinite(x) & np.isfinite(y)]), axis=0)
-    return "".join(f"M{a:.0f} {b:.0f}h0" for a, b in places.tolist())
+    known = np.isfinite(x) & np.isfinite(y)
+    points = np.stack([x, y], axis=1)[known]
+    places = np.unique(np.round(points), axis=0)
+    return "".join(f"M{right:.0f} {down:.0f}h0" for right, down in places.tolist())
 
 
 def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> str:
     """Draw bars under their names. A row: name, length, and CSS class: full, alike, empty."""
-    names = [wrap(name, round((_WIDTH - 8.0) / _LETTER)) for name, _, _ in rows]
+    letters = round((_WIDTH - 8.0) / _LETTER)
+    names = [wrap(name, letters) for name, _, _ in rows]
     lines = sum(map(len, names))
-    longest = _ROOM * max(_largest(length for _, length, _ in rows), 1e-9)
-    scale = _Scale(0.0, longest, (17.0 * lines + 25.0 * len(rows)) / _ROW, 8.0, 60.0)
+    height = 17.0 * lines + 25.0 * len(rows)
+    longest = _largest(length for _, length, _ in rows)
+    extent = _ROOM * max(longest, 1e-9)
+    scale = _Scale(0.0, extent, height / _ROW, left=8.0, room=60.0)
+    zero = scale.x(0.0)
     parts = list(scale.ticks(unit))
     y = _TOP
     for words, (_, length, kind) in zip(names, rows, strict=True):
@@ -224,22 +297,23 @@ def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> st
             parts.append(_text(0, y - 3, line))
         # The grid is drawn behind the bars alone: no line crosses a name.
         parts += scale.grid(y, y + 18.0)
-        width = max(scale.x(max(length, 0.0)) - scale.x(0.0), 1.0)
-        number = f"{length:.0f}" if abs(length) >= 100.0 else f"{length:.3g}"
-        parts.append(
-            f'<rect class="{kind}" x="{scale.x(0.0):.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>'
-            + _text(scale.x(0.0) + width + 5, y + 14, number, "soft")
-        )
+        end = scale.x(max(length, 0.0))
+        width = max(end - zero, 1.0)
+        number = f"{length:.3g}"
+        if abs(length) >= 100.0:
+            number = f"{length:.0f}"
+        parts.append(f'<rect class="{kind}" x="{zero:.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>')
+        parts.append(_text(zero + width + 5, y + 14, number, "soft"))
         y += 25.0
     return _drawing(parts, title, scale.bottom + _FOOT)
 
 
-_COLUMNS = 2  #: Drawings beside each other
+_COLUMNS = 2  #: Drawings in a row
 
 
 def sheet(drawings: Sequence[str], title: str) -> bytes:
-    """Return a file of its own with several drawings under a title, in the colours of paper."""
-    heights = [float(found[1]) for one in drawings if (found := re.search(r'viewBox="0 0 \S+ ([\d.]+)"', one))]
+    """Return a file with several drawings under a title, in the colours of paper."""
+    heights = [_height(drawing) for drawing in drawings]
     across = min(_COLUMNS, len(drawings))
     gap = 24.0
     column_width = _WIDTH + gap
@@ -250,13 +324,26 @@ def sheet(drawings: Sequence[str], title: str) -> bytes:
     placed = []
     for number, (drawing, own_height) in enumerate(zip(drawings, heights, strict=True)):
         row, column = divmod(number, across)
-        place = f'x="{gap + column * column_width:g}" y="{48 + row * row_height:g}"'
-        placed.append(drawing.replace("<svg ", f'<svg {place} width="{_WIDTH:g}" height="{own_height:g}" ', 1))
-    return (
+        x = gap + column * column_width
+        y = 48 + row * row_height
+        opening = f'<svg x="{x:g}" y="{y:g}" width="{_WIDTH:g}" height="{own_height:g}" '
+        placed.append(drawing.replace("<svg ", opening, 1))
+    content = "".join(placed)
+    paper = LIGHT["paper"]
+    text = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
-        f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{LIGHT["paper"]}"/>'
-        f"{_text(gap, 28, title)}{''.join(placed)}</svg>\n"
-    ).encode()
+        f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{paper}"/>'
+        f"{_text(gap, 28, title)}{content}</svg>\n"
+    )
+    return text.encode()
+
+
+def _height(drawing: str) -> float:
+    """Height of a drawing of `_drawing`."""
+    found = re.search(r'viewBox="0 0 \S+ ([\d.]+)"', drawing)
+    if found is None:
+        raise ValueError(f"found {drawing[:80]!r}; expected a drawing of this module with its height in viewBox")
+    return float(found[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +365,11 @@ class _Scale:
         return _TOP + _ROW * self.rows
 
     def x(self, value: float) -> float:
-        return self.left + (value - self.low) / (self.high - self.low) * (self.right - self.left)
+        share = (value - self.low) / (self.high - self.low)
+        return self.left + share * (self.right - self.left)
+
+    def clipped(self, value: float) -> float:
+        return min(max(value, self.low), self.high)
 
     def y(self, row: float) -> float:
         return _TOP + _ROW * (row + 0.5)
@@ -291,7 +382,8 @@ class _Scale:
     def grid(self, top: float, bottom: float) -> Iterator[str]:
         """Lines at the numbers of the scale, between two heights."""
         for tick in _ticks(self.low, self.high):
-            yield _line(self.x(tick), top, self.x(tick), bottom, "grid")
+            x = self.x(tick)
+            yield _line(x, top, x, bottom, "grid")
 
     def ticks(self, unit: str) -> Iterator[str]:
         """Numbers of the scale with their unit, below all rows; with a sign where some are negative."""
@@ -300,39 +392,49 @@ class _Scale:
             if self.low < 0.0 < tick:
                 number = f"+{number}"
             yield _text(self.x(tick), self.bottom + 14, number, "soft mid")
-        yield _text((self.left + self.right) / 2, self.bottom + 30, unit, "soft mid")
+        middle = (self.left + self.right) / 2
+        yield _text(middle, self.bottom + 30, unit, "soft mid")
 
 
 def _ticks(low: float, high: float) -> Iterator[float]:
     """Round numbers between two ends, three to six of them."""
     raw = (high - low) / 5.0
     power = 10.0 ** math.floor(math.log10(raw))
-    step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= raw)
-    for number in range(math.ceil(low / step), math.floor(high / step) + 1):
+    steps = [power * factor for factor in (1.0, 2.0, 5.0, 10.0)]
+    step = next(step for step in steps if step >= raw)
+    first = math.ceil(low / step)
+    last = math.floor(high / step)
+    for number in range(first, last + 1):
         yield round(number * step, 12)
 
 
 def _room(names: Iterable[str]) -> float:
     """Room to the left of a scale for the names of its rows."""
-    return max(_LEFT, min(_LETTER * max(map(len, names), default=0), _LONGEST) + 10.0)
+    letters = max(map(len, names), default=0)
+    width = min(_LETTER * letters, _LONGEST)
+    return max(_LEFT, width + 10.0)
 
 
 def _name(y: float, name: str) -> str:
     """Name of a row; one that is too long for its room is drawn narrower, not cut."""
     drawn = _text(0, y, name)
     narrow = f'<text textLength="{_LONGEST:g}" lengthAdjust="spacingAndGlyphs"'
-    return drawn.replace("<text", narrow, 1) if _LETTER * len(name) > _LONGEST else drawn
+    if _LETTER * len(name) > _LONGEST:
+        return drawn.replace("<text", narrow, 1)
+    return drawn
 
 
 def _largest(values: Iterable[float]) -> float:
-    return max((value for value in values if math.isfinite(value)), default=0.0)
+    finite = [value for value in values if math.isfinite(value)]
+    return max(finite, default=0.0)
 
 
 def _drawing(parts: Iterable[str], title: str, height: float) -> str:
     words = spelled(title)
+    content = "".join(parts)
     return (
         f'<svg viewBox="0 0 {_WIDTH:g} {height:g}" role="group" aria-label="{words}"><title>{words}</title>'
-        f"{''.join(parts)}</svg>"
+        f"{content}</svg>"
     )
 
 
@@ -345,5 +447,7 @@ def _dot(x: float, y: float, kind: str) -> str:
 
 
 def _text(x: float, y: float, text: str, kind: str = "") -> str:
-    named = f' class="{kind}"' if kind else ""
+    named = ""
+    if kind:
+        named = f' class="{kind}"'
     return f'<text{named} x="{x:.1f}" y="{y:.1f}">{spelled(text)}</text>'

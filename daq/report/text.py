@@ -12,7 +12,7 @@ from typing import Any
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
@@ -25,20 +25,34 @@ def printable(text: str) -> str:
     return _spelled_out(text, "\n")
 
 
-def _spelled_out(text: str, kept: str = "") -> str:
-    return "".join(c if c.isprintable() or c in kept else _spelled(c) for c in text)
+def _spelled_out(text: str, allowed: str = "") -> str:
+    characters = []
+    for character in text:
+        if character.isprintable() or character in allowed:
+            characters.append(character)
+        else:
+            characters.append(_spelled(character))
+    return "".join(characters)
 
 
 def _spelled(character: str) -> str:
     """A character as Python writes it: \\x1b, \\u202e."""
     number = ord(character)
-    return f"\\x{number:02x}" if number < 0x100 else f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
+    if number < 0x100:
+        return f"\\x{number:02x}"
+    if number < 0x10000:
+        return f"\\u{number:04x}"
+    return f"\\U{number:08x}"
 
 
 def origin_text(cell: str, created: str) -> str:
     """Name a calibration by its cell and date; one that a library made may have neither."""
-    of_cell = f"the calibration of {cell}" if cell else "a calibration without a name"
-    return f"{of_cell}, {created}" if created else f"{of_cell}, without a date"
+    of_cell = "a calibration without a name"
+    if cell:
+        of_cell = f"the calibration of {cell}"
+    if created:
+        return f"{of_cell}, {created}"
+    return f"{of_cell}, without a date"
 
 
 def minute_text(iso: str) -> str:
@@ -118,7 +132,8 @@ def _broken(words: Sequence[str], indent: int, width: int) -> list[str]:
         margin = indent + 2
     for word in words:
         is_empty = not line.strip()
-        if not is_empty and cell_len(line) + 1 + cell_len(word) > width:
+        needed = cell_len(line) + 1 + cell_len(word)
+        if not is_empty and needed > width:
             lines.append(line)
             line = " " * margin + word
         elif is_empty:
@@ -148,7 +163,10 @@ class WholeTable(Table):
         for column in self.columns:
             measured = [Measurement.get(console, free, value) for value in (column.header, *column.cells)]
             wanted.append(max(one.maximum for one in measured))
-            least.append(wanted[-1] if column.no_wrap else max(one.minimum for one in measured))
+            if column.no_wrap:
+                least.append(wanted[-1])
+            else:
+                least.append(max(one.minimum for one in measured))
         everything = list(range(len(least)))
         if self._width(everything, wanted) <= room:
             yield from super().__rich_console__(console, options)
@@ -168,7 +186,9 @@ class WholeTable(Table):
             yield from self._paragraphs(options.max_width)
 
     def _width(self, chosen: Collection[int], widths: list[int]) -> int:
-        return sum(widths[index] for index in chosen) + (_GAP - self.collapse_padding) * (len(chosen) - 1)
+        gap = _GAP - self.collapse_padding
+        gaps = gap * (len(chosen) - 1)
+        return sum(widths[index] for index in chosen) + gaps
 
     def _blocks(self, widths: list[int], room: int) -> list[list[int]]:
         """Columns of the tables below each other; none where a column does not fit beside the keys."""
@@ -227,7 +247,9 @@ def shared_width(least: Sequence[int], wanted: Sequence[int], chosen: Sequence[i
     return widths
 
 
-_UNBOUNDED, _GAP = 10_000, 3  #: Columns of a line
+#: Columns of a line
+_UNBOUNDED = 10_000
+_GAP = 3
 
 
 def entry_lines(name: str, text: str, indent: int, width: int) -> list[str]:
@@ -240,10 +262,16 @@ def entry_lines(name: str, text: str, indent: int, width: int) -> list[str]:
         width: columns of a line.
     """
     below = max(map(cell_len, text.split()), default=0) > width - indent
-    start = 2 if below else indent
+    start = indent
+    if below:
+        start = 2
     broken = wrap(text, max(width - start, 1), break_long_words=False, break_on_hyphens=False)
     lines = [f"{'':{start}}{line}" for line in broken or [""]]
-    return [name, *lines] if below else [f"{name}{' ' * (indent - cell_len(name))}{lines[0].lstrip()}", *lines[1:]]
+    if below:
+        return [name, *lines]
+    first, *others = lines
+    blanks = " " * (indent - cell_len(name))
+    return [f"{name}{blanks}{first.lstrip()}", *others]
 
 
 def plain_table(
@@ -255,21 +283,30 @@ def plain_table(
     keys: int = 1,
 ) -> Table:
     """Make a `WholeTable`; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
-    heading = None if title is None else terminal_text(title)
+    heading = None
+    if title is not None:
+        heading = terminal_text(title)
     table = WholeTable(heading, keys=keys)
     for index, name in enumerate(headings):
-        table.add_column(terminal_text(name), justify="left" if index in left else "right", no_wrap=index not in wrap)
+        justify: JustifyMethod = "right"
+        if index in left:
+            justify = "left"
+        table.add_column(terminal_text(name), justify=justify, no_wrap=index not in wrap)
     return table
 
 
 def known_text(value: float | None, form: str, unknown: str = "-") -> str:
     """Format a number by a format specification; `unknown` for one that is not known."""
-    return unknown if value is None else format(value, form)
+    if value is None:
+        return unknown
+    return format(value, form)
 
 
 def percent_text(percent: float) -> str:
     """Two decimals; a dash for an unknown value."""
-    return f"{percent:.2f}" if math.isfinite(percent) else "-"
+    if math.isfinite(percent):
+        return f"{percent:.2f}"
+    return "-"
 
 
 def spelled_bytes(text: str) -> str:
@@ -290,7 +327,9 @@ def inert(value: Any) -> Any:
         return value
     # csv does not quote a carriage return alone, and the text after it would become a cell of its own.
     text = spelled_bytes(value).replace("\r\n", "\n").replace("\r", "\n")
-    return f"'{text}" if text.startswith(_FORMULA) else text
+    if text.startswith(_FORMULA):
+        return f"'{text}"
+    return text
 
 
 def inert_row(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -97,7 +97,8 @@ def urdf_view(
     else:
         change = robot.parameters.torque_change_percent
         axes = ", ".join(f"{value:.2f}" for value in change.axes)
-        shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in robot.shifts[:_SHOWN_SHIFTS])
+        shown = robot.shifts[:_SHOWN_SHIFTS]
+        shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
         yield (
             f"No physical robot has exactly the identified parameters; the torque of this one differs by "
             f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
@@ -147,25 +148,35 @@ def urdf_report(
         out: the URDF.
     """
     parameters = robot.parameters
+    shifts = [
+        ShiftedParameter.of(shift, physical=shift.realised, standard_deviations=shift.deviations)
+        for shift in robot.shifts
+    ]
+    joints = []
+    for number, update in enumerate(updates.values()):
+        joints.append(_joint(robot, number, update, updated))
+    columns = zip(parameters.model.columns, parameters.standard, strict=True)
+    not_in_urdf = [NotInUrdf.of(column, value=value) for column, value in columns if _is_of_motor(column.name)]
+    effects = [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
+    closures = [closure.name for closure in parameters.model.robot.closures]
     return UrdfReport.of(
         parameters,
         urdf=out,
         calibration=calibration.cell or None,
         same_configuration=same_configuration,
-        shifts=[
-            ShiftedParameter.of(one, physical=one.realised, standard_deviations=one.deviations) for one in robot.shifts
-        ],
+        shifts=shifts,
         margin=MARGIN,
-        joints=[_joint(robot, number, update, updated) for number, update in enumerate(updates.values())],
+        joints=joints,
         merged_links=updated.merged,
-        not_in_urdf=[
-            NotInUrdf.of(column, value=value)
-            for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
-            if column.name.startswith(("Ia", "off", "fvm", "fsm")) and not column.name.endswith(LOADED)
-        ],
-        effects_left_out=[f"{effect.name} on {effect.axis}" for effect in calibration.effects],
-        closures_left_out=[closure.name for closure in parameters.model.robot.closures],
+        not_in_urdf=not_in_urdf,
+        effects_left_out=effects,
+        closures_left_out=closures,
     )
+
+
+def _is_of_motor(name: str) -> bool:
+    """Whether a parameter is of a motor, which a URDF has no place for."""
+    return name.startswith(("Ia", "off", "fvm", "fsm")) and not name.endswith(LOADED)
 
 
 def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:

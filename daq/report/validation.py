@@ -251,4 +251,6 @@ def _checked_payload(run: WeighedRun, *, with_bare_runs: bool) -> CheckedPayload
 
 
 def _found_mass(mass: Mass | str) -> FoundMass:
-    return FoundMass(reason=mass) if isinstance(mass, str) else FoundMass.of(mass)
+    if isinstance(mass, str):
+        return FoundMass(reason=mass)
+    return FoundMass.of(mass)

@@ -135,8 +135,7 @@ NOISE_ROWS = 4.0
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     """Mass, centre and inertia, the ten parameters, and doubts."""
     body = found.body
-    is_last = found.cell.chain is None and found.cell.platform is None
-    carrier = "flange" if is_last else "platform"
+    carrier = _carrier(found.cell)
     nothing = _shows_nothing(body)
     turns = not np.isnan(body.values[:-1]).all()
     shown = turns and not nothing
@@ -149,23 +148,20 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
     yield table
     if shown:
         platform = _platform(found.cell)
-        but = "" if platform is None else f"; `centre … in {platform[0]}` is in the link's own frame"
+        but = ""
+        if platform is not None:
+            but = f"; `centre … in {platform[0]}` is in the link's own frame"
         yield f"In the frame of {carrier_text(found.cell)}{but}."
     elif not turns:
         yield f"The {carrier} does not turn in these moves: centre and inertia cannot be seen."
     if found.declared_kg is not None:
-        yield f"The logs declare {found.declared_kg:g} kg: {100.0 * (body.mass_kg / found.declared_kg - 1.0):+.2f} %."
-    within = "moves, gains, robot and effects" if body.complete else "moves and gains"
-    if body.mass_reference_std_kg > 0.0:
-        within += " and with the tolerance of the calibration's payload mass"
-    how = "robot and body together, beside runs without load" if found.bare else "on the robot of the calibration"
-    yield f"Found {how}; σ from {body.moves} moves, with the errors of {within}; it leaves {body.error.total:.3g} %."
+        difference_percent = 100.0 * (body.mass_kg / found.declared_kg - 1.0)
+        yield f"The logs declare {found.declared_kg:g} kg: {difference_percent:+.2f} %."
+    yield _basis_text(found)
     if shown:
         headings = ("parameter", "value ± σ", "unit", "identifiable")
         ten = plain_table(headings, title="The ten about the joint's frame", left=(0, 2, 3))
-        rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
-        for name, unit, value, std, identifiable in rows:
-            ten.add_row(name, with_deviation(value, std), unit, "yes" if identifiable else "no")
+        _add_parameters(ten, body)
         yield ""
         yield ten
         if any(np.isfinite(body.std) & ~body.identifiable):
@@ -174,9 +170,47 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
                 "steel cube of the least mass (m − 2 σ) has."
             )
     if not nothing:
-        # Below the table: beside the rows they would push σ and unit off a terminal of 80 columns.
-        yield from (f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})" for one in found.help)
+        # Below the table: in its rows they would push σ and unit off a terminal of 80 columns.
+        for one in found.help:
+            yield f"{one.name}: add {one.seconds:.0f} s of {one.words} (σ {one.std:.2g})"
     yield from (Text(doubt, style="bold") for doubt in _doubts(found))
+
+
+def _carrier(cell: Cell) -> str:
+    """Part of the robot that carries the body."""
+    if cell.chain is None and cell.platform is None:
+        return "flange"
+    return "platform"
+
+
+def _basis_text(found: Weighed) -> str:
+    """Return what the body was found on, and which errors its σ includes."""
+    body = found.body
+    errors = "moves and gains"
+    if body.complete:
+        errors = "moves, gains, robot and effects"
+    if body.mass_reference_std_kg > 0.0:
+        errors += " and with the tolerance of the calibration's payload mass"
+    how = "on the robot of the calibration"
+    if found.bare:
+        how = "robot and body together, beside runs without load"
+    left = f"it leaves {body.error.total:.3g} %"
+    return f"Found {how}; σ from {body.moves} moves, with the errors of {errors}; {left}."
+
+
+def _add_parameters(table: Table, body: WeighedBody) -> None:
+    rows = zip(LINK_PARAMETERS, LINK_UNITS, body.values, body.std, body.identifiable, strict=True)
+    for name, unit, value, std, identifiable in rows:
+        known = "no"
+        if identifiable:
+            known = "yes"
+        table.add_row(name, with_deviation(value, std), unit, known)
+
+
+def _smallest_pseudo_inertia(body: WeighedBody) -> float:
+    """Smallest eigenvalue of the pseudo-inertia; negative where no solid body has this inertia."""
+    eigenvalues = np.linalg.eigvalsh(pseudo_inertia(body.values))
+    return float(eigenvalues[0])
 
 
 def _shows_nothing(body: WeighedBody) -> bool:
@@ -206,8 +240,8 @@ def _doubts(found: Weighed) -> Iterator[str]:
             f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. Is it the same "
             "robot, and one body mounted one way?"
         )
-    whole = not _shows_nothing(body) and not np.isnan(body.values).any()
-    if whole and np.linalg.eigvalsh(pseudo_inertia(body.values))[0] < 0.0:
+    is_known = not _shows_nothing(body) and not np.isnan(body.values).any()
+    if is_known and _smallest_pseudo_inertia(body) < 0.0:
         yield "No solid body has exactly this inertia; use it within its σ."
 
 
@@ -229,12 +263,19 @@ def _platform(cell: Cell) -> tuple[str, Place] | None:
         return None
     frame = read_urdf(cell.urdf).links[cell.platform]
     same = np.allclose(frame.rotation, np.eye(3)) and not frame.translation_m.any()
-    return None if same else (cell.platform, frame)
+    if same:
+        return None
+    return (cell.platform, frame)
 
 
 def weigh_report(found: Weighed) -> WeighReport:
     """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show them."""
-    body, platform = found.body, _platform(found.cell)
+    body = found.body
+    platform = _platform(found.cell)
+    centre_in_platform_m = None
+    if platform is not None:
+        _, frame = platform
+        centre_in_platform_m = _weighed_values(*body.centre_in(frame))
     return WeighReport.of(
         found,
         body,
@@ -243,7 +284,7 @@ def weigh_report(found: Weighed) -> WeighReport:
         mass_kg=WeighedValue(value=body.mass_kg, std=body.mass_std_kg),
         mass_std_of_reference_kg=body.mass_reference_std_kg,
         centre_m=_weighed_values(*body.centre_m),
-        centre_in_platform_m=None if platform is None else _weighed_values(*body.centre_in(platform[1])),
+        centre_in_platform_m=centre_in_platform_m,
         inertia_about_centre_kg_m2=_weighed_values(*body.inertia_kg_m2),
         parameters=_weighed_parameters(found),
         relative_error_percent=body.error,
@@ -258,8 +299,9 @@ def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
     body = found.body
     moves_std = np.sqrt(np.diag(body.moves_covariance))
     moves = {one.name: one for one in found.help}
-    return [
-        WeighedParameter.of(
+    parameters = []
+    for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True)):
+        parameter = WeighedParameter.of(
             name=name,
             unit=unit,
             value=body.values[index],
@@ -268,8 +310,8 @@ def _weighed_parameters(found: Weighed) -> list[WeighedParameter]:
             identifiable=body.identifiable[index],
             add=moves.get(name),
         )
-        for index, (name, unit) in enumerate(zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
-    ]
+        parameters.append(parameter)
+    return parameters
 
 
 def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
@@ -277,23 +319,31 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
     headings = ("axis", "quiet s", "band ±", "threshold", "largest", "unit")
     table = plain_table(headings, title="External torque (medians over the motion)", left=(0, 5))
     for shown, quiet_s in zip(_contact_axes(found, cell), found.band.quiet_s, strict=True):
-        figures = (known_text(figure, ".3g") for figure in (shown.band, shown.threshold, shown.largest))
-        table.add_row(shown.axis, f"{quiet_s:.0f}", *figures, shown.unit)
+        band = known_text(shown.band, ".3g")
+        threshold = known_text(shown.threshold, ".3g")
+        largest = known_text(shown.largest, ".3g")
+        table.add_row(shown.axis, f"{quiet_s:.0f}", band, threshold, largest, shown.unit)
     yield table
-    source = "this log" if found.from_itself else "the quiet logs"
+    source = "the quiet logs"
+    if found.from_itself:
+        source = "this log"
     if found.from_itself and found.left_out:
-        stretches = "1 stretch that is" if found.left_out == 1 else f"{found.left_out} stretches that are"
+        stretches = "1 stretch that is"
+        if found.left_out != 1:
+            stretches = f"{found.left_out} stretches that are"
         source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
         "motion like that, all axes together, on average and from five quiet minutes on. Standstill is not judged."
     )
-    contacts, missing = found.contacts, not_judged(found, cell)
+    contacts = found.contacts
+    missing = not_judged(found, cell)
     yield ""
     if not contacts and len(missing) < len(cell.axes):
         judged = ", ".join(name for name in cell.axis_names if name not in missing)
         yield f"No contact on {judged}." if missing else "No contact."
-    yield from (Text(f"{name} not judged: {reason}.", style="bold") for name, reason in missing.items())
+    for name, reason in missing.items():
+        yield Text(f"{name} not judged: {reason}.", style="bold")
     if not contacts:
         return
     listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
@@ -315,7 +365,8 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
 def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
     """Say why an axis cannot show a contact, by its name; only axes without a threshold or without motion."""
     reasons = {}
-    band, row_s = found.band, float(np.median(np.diff(found.time_s)))
+    band = found.band
+    row_s = float(np.median(np.diff(found.time_s)))
     for axis, level, use, quiet_s, correlation_s in zip(
         cell.axis_names, band.threshold, found.use, band.quiet_s, band.correlation_s, strict=True
     ):
@@ -335,6 +386,13 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
 
 def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> ContactReport:
     """Return band and threshold of each axis, and the contacts."""
+    contacts = []
+    for contact in found.contacts:
+        axis = cell.axis_names[contact.axis]
+        contacts.append(ContactEntry.of(contact, axis=axis, peak=contact.peak_nm))
+    missing = []
+    for axis, reason in not_judged(found, cell).items():
+        missing.append(NotJudged(axis=axis, reason=reason))
     return ContactReport.of(
         cell=cell.name,
         log=log,
@@ -342,8 +400,8 @@ def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path |
         stretches_left_out=found.left_out,
         alarms_per_hour=found.band.alarms_per_hour,
         axes=_contact_axes(found, cell),
-        contacts=[ContactEntry.of(one, axis=cell.axis_names[one.axis], peak=one.peak_nm) for one in found.contacts],
-        not_judged=[NotJudged(axis=axis, reason=reason) for axis, reason in not_judged(found, cell).items()],
+        contacts=contacts,
+        not_judged=missing,
         picture=picture,
     )
 
@@ -361,18 +419,17 @@ def _contact_axes(found: ExternalTorque, cell: Cell) -> list[ContactAxis]:
                 "threshold": np.median(found.threshold_nm[index, use]),
                 "largest": np.abs(found.torque_nm[index, use]).max(),
             }
-        axes.append(
-            ContactAxis.of(
-                axis=axis.name,
-                unit=axis.unit.force,
-                scale=learned.scale[index],
-                band_over_scale=learned.factor[index],
-                threshold_over_scale=learned.threshold[index],
-                correlation_s=learned.correlation_s[index],
-                quiet_s=learned.quiet_s[index],
-                **figures,
-            )
+        contact_axis = ContactAxis.of(
+            axis=axis.name,
+            unit=axis.unit.force,
+            scale=learned.scale[index],
+            band_over_scale=learned.factor[index],
+            threshold_over_scale=learned.threshold[index],
+            correlation_s=learned.correlation_s[index],
+            quiet_s=learned.quiet_s[index],
+            **figures,
         )
+        axes.append(contact_axis)
     return axes
 
 
@@ -382,12 +439,13 @@ def draw_contact(found: ExternalTorque, cell: Cell, log: Path, folder: Path) -> 
     Raises:
         OSError: from the file system.
     """
-    figure, places = panels(len(cell.axes), 2, f"{unformatted(log.stem)}: external torque of {unformatted(cell.name)}")
+    title = f"{unformatted(log.stem)}: external torque of {unformatted(cell.name)}"
+    figure, places = panels(len(cell.axes), 2, title)
     for index, (axis, place) in enumerate(zip(cell.axes, places, strict=True)):
         use = found.use[index]
-        torque, band, threshold = (
-            np.where(use, one[index], np.nan) for one in (found.torque_nm, found.band_nm, found.threshold_nm)
-        )
+        torque = np.where(use, found.torque_nm[index], np.nan)
+        band = np.where(use, found.band_nm[index], np.nan)
+        threshold = np.where(use, found.threshold_nm[index], np.nan)
         place.fill_between(found.time_s, -band, band, color=SKY, alpha=0.5, linewidth=0.0, label="band, 95 %")
         for sign, label in ((1.0, "threshold"), (-1.0, None)):
             place.plot(found.time_s, sign * threshold, color=ORANGE, linewidth=0.9, label=label)

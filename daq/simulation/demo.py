@@ -53,6 +53,7 @@ from drivers.canopen.node_scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import Account, account
+from ident.estimators.estimate import RelativeError
 
 MARK = ".drivegain-demo"
 AUDIT = "audit.jsonl"
@@ -67,7 +68,7 @@ RUNS = (
     ("loaded-2", "disc", "b"),
     ("held-out", "disc", "c"),
 )
-"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last is held out."""
+"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last validates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,21 +120,23 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(cell_file)
     out = settings.out
-    replaced = make_room(out, tuple(out / f"{name}.mcap" for name, _, _ in RUNS))
+    logs = tuple(out / f"{name}{SUFFIX}" for name, _, _ in RUNS)
+    replaced = make_room(out, logs)
     if replaced:
         names = ", ".join(log.name for log in replaced)
         reporter.step(f"start anew: {names} of an earlier demonstration are recorded again and replaced")
     reporter.step("scan the bus")
-    with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
+    spec = load_simulation(settings.simulation)
+    with _simulated(cell, spec), network_of(cell) as network:
         nodes = network.scan()
         network.check_identities()
     reporter.step("plan exciting moves")
-    plans = tuple(_plan(settings, cell, index, reporter) for index in range(len(PLANS)))
+    plans = [_plan(settings, cell, index, reporter) for index in range(len(PLANS))]
     stages = DemoStages(settings, cell, now, reporter)
     stages.run(cell_file)
     reporter.step("draw the pictures")
-    spec = load_simulation(settings.simulation)
-    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+    true_gains = [true.gain_nm_per_a for true in spec.axes]
+    truth = dict(zip(cell.axis_names, true_gains, strict=True))
     fitted = stages.fitted
     calibration = stages.calibration
     proposal = stages.proposal
@@ -144,7 +147,18 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     compared = compare(cell, request, file=out / CONTROLLER_COPY, audit=out / AUDIT)
     save_report(fitted, changed, calibration, out / REPORT, compared)
     recorded = tuple(stages.recorded[name] for name, _, _ in RUNS)
-    return DemoOutcome(cell, nodes, plans, recorded, fitted, changed, calibration, truth, proposal, stages.written)
+    return DemoOutcome(
+        cell=cell,
+        nodes=nodes,
+        plans=tuple(plans),
+        recorded=recorded,
+        fitted=fitted,
+        changed=changed,
+        calibration=calibration,
+        truth=truth,
+        proposal=proposal,
+        written=stages.written,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,19 +213,22 @@ class DemoStages:
         controller_copy = out / CONTROLLER_COPY
         replace_file(controller_copy, cell.controller_path.read_bytes())
         masses_kg = {payload.name: payload.mass_kg for payload in cell.payloads}
-        context = SessionContext(
-            cell_file,
-            cell,
-            _Limits(out, self._settings.seed),
-            FixedRuns(_planned_runs(out, masses_kg)),
-            # A run powers on a cell that carries its payload: there is nothing to mount.
-            GivenAnswers("demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell"),
-            GainTarget(cell, HistoryPlace(out / "history.sqlite", out / AUDIT), controller_copy),
-            self._tools(),
-            Journal(StringIO(), Form.TEXT, self._now),
-        )
+        limits = _Limits(out, self._settings.seed)
+        runs = FixedRuns(_planned_runs(out, masses_kg))
+        # A run powers on a cell that carries its payload: there is nothing to mount.
+        answers = GivenAnswers("demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell")
+        history = HistoryPlace(out / "history.sqlite", out / AUDIT)
+        target = GainTarget(cell, history, controller_copy)
+        journal = Journal(StringIO(), Form.TEXT, self._now)
+        context = SessionContext(cell_file, cell, limits, runs, answers, target, self._tools(), journal)
         at = self._now().isoformat(timespec="seconds")
-        state = JobState(session="demo", cell=cell.name, configuration_sha256=cell.digest, began=at, attempt_began=at)
+        state = JobState(
+            session="demo",
+            cell=cell.name,
+            configuration_sha256=cell.digest,
+            began=at,
+            attempt_began=at,
+        )
         with suppress(CalibrationRefused):
             run_stages(TO_DECISION, context, save(Session(out, state)))
 
@@ -265,10 +282,15 @@ class DemoStages:
         settings = self._settings
         reporter = self._reporter
         name = request.out.stem
-        payload = None if request.payload is None else request.payload.name
+        payload = None
+        if request.payload is not None:
+            payload = request.payload.name
         self._attempts[name] += 1
         if name not in self.recorded:
-            reporter.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+            load = "without load"
+            if payload is not None:
+                load = f"with {payload}"
+            reporter.step(f"record {name}: {load}")
         else:
             # A busy computer lets the simulated cell answer late, or twice in a period.
             reason = self.recorded[name].log.reason
@@ -276,11 +298,13 @@ class DemoStages:
             reporter.step(f"record {name} again ({again} of at most {RETRIES} times): {reason}")
         spec = load_simulation(settings.simulation, payload)
         # Another noise in every run, as another day would bring; the plant is the same.
-        index = [run for run, _, _ in RUNS].index(name)
-        spec = replace(spec, seed=spec.seed + 100 * settings.seed + index)
+        names = [run for run, _, _ in RUNS]
+        seed = spec.seed + 100 * settings.seed + names.index(name)
+        spec = replace(spec, seed=seed)
+        request = replace(request, run_id=f"demo-{settings.seed}-{name}")
         with _simulated(self._cell, spec):
             self.recorded[name] = record(
-                replace(request, run_id=f"demo-{settings.seed}-{name}"),
+                request,
                 free=free,
                 block_signals=block_signals,
                 progress=lambda done, total: reporter.progress(done, total, "moves"),
@@ -291,30 +315,43 @@ class DemoStages:
 
 def _planned_runs(out: Path, masses_kg: dict[str, float]) -> tuple[PlannedRun, ...]:
     """Return the runs of the demonstration."""
-    return tuple(
-        PlannedRun(
+    last_name, _, _ = RUNS[-1]
+    runs = []
+    for name, payload, plan_name in RUNS:
+        mass_kg = None
+        if payload is not None:
+            mass_kg = masses_kg[payload]
+        run = PlannedRun(
             name=name,
             payload=payload,
-            mass_kg=None if payload is None else masses_kg[payload],
+            mass_kg=mass_kg,
             plan_file=out / f"plan-{plan_name}.yaml",
-            holdout=name == RUNS[-1][0],
+            holdout=name == last_name,
         )
-        for name, payload, plan_name in RUNS
-    )
+        runs.append(run)
+    return tuple(runs)
 
 
 def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
     """Return the outcome as `summary.json` holds it; `seconds` is how long the demonstration took."""
-    before, after = outcome.fitted.identification.holdout_error, outcome.fitted.final.holdout_error
+    before = outcome.fitted.identification.holdout_error
+    after = outcome.fitted.final.holdout_error
     first = next(iter(outcome.calibration.effects), None)
+    effect = None
+    if first is not None:
+        effect = FleetEffect(name=first.name, axis=first.axis)
+    entries = as_document(outcome.calibration)["effects"]
+    effects = [EffectEntry.model_validate(entry, strict=False) for entry in entries]
+    before_percent, before_percent_axes = _error_percent(before)
+    after_percent, after_percent_axes = _error_percent(after)
     return DemoReport(
         gains=demo_gains(outcome),
-        effect=None if first is None else FleetEffect(name=first.name, axis=first.axis),
-        effects=[EffectEntry.model_validate(one, strict=False) for one in as_document(outcome.calibration)["effects"]],
-        error_before_percent=None if before is None else before.total,
-        error_after_percent=None if after is None else after.total,
-        error_before_percent_axes=None if before is None else list(before.axes),
-        error_after_percent_axes=None if after is None else list(after.axes),
+        effect=effect,
+        effects=effects,
+        error_before_percent=before_percent,
+        error_after_percent=after_percent,
+        error_before_percent_axes=before_percent_axes,
+        error_after_percent_axes=after_percent_axes,
         plans=[_made(made) for made in outcome.plans],
         logs=[_recorded(run) for run in outcome.recorded],
         controller_diff=outcome.proposal.edit.diff,
@@ -323,23 +360,36 @@ def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
     )
 
 
+def _error_percent(error: RelativeError | None) -> tuple[float | None, list[float | None] | None]:
+    """Return a relative error of all axes together and of each; None where there is none."""
+    if error is None:
+        return None, None
+    return error.total, list(error.axes)
+
+
 def demo_gains(outcome: DemoOutcome) -> list[DemoGain]:
-    """Return each gain beside the truth."""
+    """Return each gain with the true one."""
+    gains = outcome.calibration.gains
     paper = outcome.fitted.paper
-    values = [None] * len(outcome.truth) if paper is None else paper.gains.tolist()
-    return [
-        _gain(gain, outcome.truth[gain.axis], tls) for gain, tls in zip(outcome.calibration.gains, values, strict=True)
-    ]
+    paper_gains: list[float | None] = [None] * len(gains)
+    if paper is not None:
+        paper_gains = paper.gains.tolist()
+    compared = []
+    for gain, paper_tls in zip(gains, paper_gains, strict=True):
+        truth = outcome.truth[gain.axis]
+        compared.append(_gain(gain, truth, paper_tls))
+    return compared
 
 
 def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
+    error_percent = 100.0 * (gain.value / truth - 1.0)
     return DemoGain(
         axis=gain.axis,
         nameplate=gain.nameplate,
         identified=gain.value,
         std_percent=gain.std_percent,
         truth=truth,
-        error_percent=100.0 * (gain.value / truth - 1.0),
+        error_percent=error_percent,
         paper_tls=paper_tls,
     )
 
@@ -371,7 +421,7 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
     Returns:
         those of the logs that were there.
     """
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
+    if out.exists() and not _is_replaceable(out):
         raise UsageError(
             str(out),
             found="something that is no folder of a demonstration",
@@ -384,12 +434,22 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-    for older in chain(out.glob("residual-*"), out.glob(f"*-aside-*{SUFFIX}")):
+    pictures = out.glob("residual-*")
+    logs_aside = out.glob(f"*-aside-*{SUFFIX}")
+    for older in chain(pictures, logs_aside):
         older.unlink()
     # The audit and its head: the copy of the controller file is a new one.
     for older in (out / AUDIT, head_file(out / AUDIT)):
         older.unlink(missing_ok=True)
     return replaced
+
+
+def _is_replaceable(out: Path) -> bool:
+    """Whether a path is an empty folder, or that of an earlier demonstration."""
+    if not out.is_dir():
+        return False
+    is_empty = not any(out.iterdir())
+    return is_empty or (out / MARK).is_file()
 
 
 @contextmanager
@@ -406,13 +466,18 @@ def _simulated(cell: Cell, spec: CellSpec) -> Iterator[None]:
 
 
 def _plan(settings: Settings, cell: Cell, index: int, reporter: ProgressReporter) -> Plan:
+    name = PLANS[index]
     exchanges = 800
+
+    def report_exchange(done: int, std_percent: float) -> None:
+        reporter.progress(done, exchanges, f"plan {name}, worst gain σ {std_percent:.2f} %")
+
     made = plan(
         cell,
         seed=10 * settings.seed + index,
         duration_s=settings.duration_s,
         exchanges=exchanges,
-        progress=lambda done, std: reporter.progress(done, exchanges, f"plan {PLANS[index]}, worst gain σ {std:.2f} %"),
+        progress=report_exchange,
     )
-    save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
+    save_plan(made, settings.out / f"plan-{name}.yaml")
     return made

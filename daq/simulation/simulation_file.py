@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,17 +39,24 @@ CURRENT_A = (1e-6, 1e6)  #: Rated and peak current of an amplifier
 LARGEST_NUMBER = 1e9  #: Any other number, in its own unit: far beyond any robot, far below an overflow
 LAST_CYCLE = 10**12  #: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
 
+_Name = Annotated[str, Field(min_length=1)]
+_Time = Annotated[float, Field(ge=0, le=LONGEST_S)]
+_Duration = Annotated[float, Field(gt=0, le=LONGEST_S)]
+_Cycle = Annotated[int, Field(ge=0, le=LAST_CYCLE)]
+_Cycles = Annotated[int, Field(ge=1, le=LAST_CYCLE)]
+_EmcyCode = Annotated[int, Field(ge=0x1000, le=0xFFFF)]
+
 
 class FaultModel(StrictModel):
     """Something that goes wrong; times count from power-on, in the time of the plant."""
 
     fault: FaultKind
     axis: AxisName | None = None
-    at_s: Annotated[float, Field(ge=0, le=LONGEST_S)] | None = None
-    at_cycle: Annotated[int, Field(ge=0, le=LAST_CYCLE)] | None = None
-    for_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
-    cycles: Annotated[int, Field(ge=1, le=LAST_CYCLE)] | None = None
-    emcy_code: Annotated[int, Field(ge=0x1000, le=0xFFFF)] | None = None
+    at_s: _Time | None = None
+    at_cycle: _Cycle | None = None
+    for_s: _Duration | None = None
+    cycles: _Cycles | None = None
+    emcy_code: _EmcyCode | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> FaultModel:
@@ -64,14 +70,20 @@ class FaultModel(StrictModel):
 
     def spec(self, period_us: int) -> FaultSpec:
         """In SYNCs."""
-        begin = self.at_cycle or 0 if self.at_s is None else round(self.at_s * 1e6 / period_us)
-        cycles = self.cycles if self.for_s is None else max(1, round(self.for_s * 1e6 / period_us))
-        axis = None if self.axis is None else axis_index(self.axis)
+        begin = self.at_cycle or 0
+        if self.at_s is not None:
+            begin = round(self.at_s * 1e6 / period_us)
+        cycles = self.cycles
+        if self.for_s is not None:
+            cycles = max(1, round(self.for_s * 1e6 / period_us))
+        axis = None
+        if self.axis is not None:
+            axis = axis_index(self.axis)
         return FaultSpec(self.fault, axis, begin, cycles, self.emcy_code or 0)
 
 
 class ScenarioModel(StrictModel):
-    """A whole scenario file."""
+    """A scenario file."""
 
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.SCENARIO
 
@@ -91,55 +103,63 @@ def load_scenario(path: Path, axes: int, period_us: int) -> tuple[FaultSpec, ...
     """
     document = parse_yaml(read_yaml_bytes(path), str(path))
     model = read_model(document, ScenarioModel)
-    if wrong := absent_axes(model.faults, axes):
-        raise ConfigurationInconsistent(**fault_texts(document, wrong), remedy="correct the scenario file")
+    wrong = absent_axes(model.faults, axes)
+    if wrong:
+        texts = fault_texts(document, wrong)
+        raise ConfigurationInconsistent(**texts, remedy="correct the scenario file")
     return tuple(fault.spec(period_us) for fault in model.faults)
 
 
 def absent_axes(faults: Sequence[FaultModel], axes: int) -> list[Fault]:
     """Describe faults on axes that the cell lacks."""
-    return [
-        Fault(("faults", number, "axis"), f"axis {fault.axis}", f"J1 to J{axes}")
-        for number, fault in enumerate(faults)
-        if fault.axis is not None and axis_index(fault.axis) >= axes
-    ]
+    absent = []
+    for number, fault in enumerate(faults):
+        if fault.axis is not None and axis_index(fault.axis) >= axes:
+            place = ("faults", number, "axis")
+            absent.append(Fault(place, f"axis {fault.axis}", f"J1 to J{axes}"))
+    return absent
 
 
 def axis_index(axis: str | int) -> int:
     """Index from 0 of an axis given as "J3" or by its number from 1."""
-    number = int(re.sub(r"^J", "", axis)) if isinstance(axis, str) else axis
-    return number - 1
+    if isinstance(axis, str):
+        return int(axis.removeprefix("J")) - 1
+    return axis - 1
 
 
 class PlantedEffectModel(StrictModel):
     """An undeclared effect, on an axis, on a passive joint of a closed chain, or in the pivot of a closure."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: _Name
     axis: AxisName | None = None
-    joint: Annotated[str, Field(min_length=1)] | None = None
-    closure: Annotated[str, Field(min_length=1)] | None = None
+    joint: _Name | None = None
+    closure: _Name | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_place(self) -> PlantedEffectModel:
-        given = [place for place in (self.axis, self.joint, self.closure) if place is not None]
+        places = (self.axis, self.joint, self.closure)
+        given = [place for place in places if place is not None]
         if len(given) != 1:
             raise ValueError("axis, or joint for a passive joint, or closure for a pivot: one of them")
         return self
 
     def effect(self) -> UndeclaredEffect:
         """As the plant knows it."""
-        axis = -1 if self.axis is None else axis_index(self.axis)
-        return UndeclaredEffect(self.name, axis, dict(self.parameters), self.joint, self.closure)
+        axis = -1
+        if self.axis is not None:
+            axis = axis_index(self.axis)
+        parameters = dict(self.parameters)
+        return UndeclaredEffect(self.name, axis, parameters, self.joint, self.closure)
 
 
 class SimulationModel(StrictModel):
-    """A whole simulation file."""
+    """A simulation file."""
 
     reference: ClassVar[str] = "schemas.md"
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.SIMULATION
 
-    urdf: Annotated[str, Field(min_length=1)]
+    urdf: _Name
     gravity_m_s2: tuple[float, float, float]
     ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1)]
     sync_period_us: Annotated[int, Field(ge=250, le=1_000_000)]
@@ -192,39 +212,47 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
     _check(document, model)
     urdf_path = path.parent / model.urdf
     urdf = urdf_text(read_yaml_bytes(urdf_path), str(urdf_path))
-    if model.closures and (wrong := [*_closed_chain_faults(model, urdf)]):
-        raise ConfigurationInconsistent(**fault_texts(document, wrong), remedy="correct the simulation file")
+    if model.closures:
+        _refuse(document, list(_closed_chain_faults(model, urdf)))
     if payload is not None and payload not in model.payloads:
         raise UsageError(
             f"payload {payload!r}",
             found="no such body in the simulation",
-            expected=f"one of {', '.join(model.payloads) or 'none: it has no payloads'}",
+            expected=f"one of {_payload_names(model)}",
             remedy=f"choose one, or add it to {path}",
         )
+    start = [_position_si(degrees, millimetres) for degrees, millimetres in _starts(model)]
+    assembly = {}
+    for name, degrees in model.assembly_deg.items():
+        assembly[name] = DEGREE.si * degrees
+    for name, millimetres in model.assembly_mm.items():
+        assembly[name] = MILLIMETRE.si * millimetres
+    mounted = None
+    if payload is not None:
+        mounted = model.payloads[payload]
+    tuned_with = None
+    if model.tuned_with is not None:
+        tuned_with = model.payloads[model.tuned_with]
+    effects = tuple(effect.effect() for effect in model.effects)
+    faults = tuple(fault.spec(model.sync_period_us) for fault in model.faults)
     return CellSpec(
         urdf=urdf,
         gravity_m_s2=model.gravity_m_s2,
         ratio=np.array(model.ratio, dtype=np.float64),
         axes=model.axes,
-        start_rad=np.array(
-            [
-                MILLIMETRE.si * (millimetres or 0.0) if degrees is None else DEGREE.si * degrees
-                for degrees, millimetres in _starts(model)
-            ]
-        ),
-        payload=None if payload is None else model.payloads[payload],
-        effects=tuple(effect.effect() for effect in model.effects),
+        start_rad=np.array(start),
+        payload=mounted,
+        effects=effects,
         sync_period_us=model.sync_period_us,
         substeps=model.substeps,
         seed=model.seed,
-        faults=tuple(fault.spec(model.sync_period_us) for fault in model.faults),
+        faults=faults,
         closures=model.closures,
         motors=model.motors,
         platform=model.platform,
-        assembly_rad={name: DEGREE.si * degrees for name, degrees in model.assembly_deg.items()}
-        | {name: MILLIMETRE.si * millimetres for name, millimetres in model.assembly_mm.items()},
+        assembly_rad=assembly,
         passive=model.passive,
-        tuned_with=None if model.tuned_with is None else model.payloads[model.tuned_with],
+        tuned_with=tuned_with,
     )
 
 
@@ -235,48 +263,99 @@ def shipped_simulation(name: str = "demo") -> Path:
 
 def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
     """Position of each joint: degrees and millimetres, one of them None."""
-    n = len(model.axes)
-    return list(zip(model.start_deg or (None,) * n, model.start_mm or (None,) * n, strict=True))
+    unknown = (None,) * len(model.axes)
+    degrees = model.start_deg or unknown
+    millimetres = model.start_mm or unknown
+    return list(zip(degrees, millimetres, strict=True))
+
+
+def _position_si(degrees: float | None, millimetres: float | None) -> float:
+    """Position of a joint [rad or m]; 0 where neither is given."""
+    if degrees is not None:
+        return DEGREE.si * degrees
+    return MILLIMETRE.si * (millimetres or 0.0)
+
+
+def _payload_names(model: SimulationModel) -> str:
+    return ", ".join(model.payloads) or "none: it has no payloads"
+
+
+def _refuse(document: Document, faults: list[Fault]) -> None:
+    """Refuse a simulation file with faults."""
+    if faults:
+        texts = fault_texts(document, faults)
+        raise ConfigurationInconsistent(**texts, remedy="correct the simulation file")
 
 
 def _check(document: Document, model: SimulationModel) -> None:
     n = len(model.axes)
     faults = [
-        Fault((key,), "given without closures", "closures of a closed chain, or none of its keys")
-        for key in ("motors", "platform", "assembly_deg", "assembly_mm", "passive")
-        if getattr(model, key) and not model.closures
-    ]
-    if len(model.ratio) != n or any(len(row) != n for row in model.ratio):
-        faults.append(Fault(("ratio",), f"{len(model.ratio)} rows", f"{n} × {n}, a row for each motor"))
-    if len(model.start_deg) != n and (model.start_deg or not model.start_mm):
-        faults.append(Fault(("start_deg",), f"{len(model.start_deg)} angles", f"{n}, one for each joint"))
-    elif len(model.start_mm) not in (0, n):
-        faults.append(Fault(("start_mm",), f"{len(model.start_mm)} positions", f"{n}, one for each joint"))
-    else:
-        faults += [
-            Fault(("start_mm" if model.start_mm else "start_deg",), f"joint {joint}: {found}", "deg, or mm, and null")
-            for joint, found in enumerate(_starts(model), start=1)
-            if found.count(None) != 1
-        ]
-    if len({axis.node_id for axis in model.axes}) != n:
-        faults.append(Fault(("axes",), "a node id used twice", "each node once"))
-    faults += [
-        Fault(("axes", index, "gain_nm_per_a"), "0", "a gain that is not zero")
-        for index, axis in enumerate(model.axes)
-        if axis.gain_nm_per_a == 0.0
-    ]
-    faults += [
-        Fault(("effects", index, "axis"), f"axis {effect.axis}", f"J1 to J{n}")
-        for index, effect in enumerate(model.effects)
-        if effect.axis is not None and axis_index(effect.axis) >= n
+        *_closure_key_faults(model),
+        *_ratio_faults(model),
+        *_start_faults(model),
+        *_axis_faults(model),
     ]
     if model.tuned_with is not None and model.tuned_with not in model.payloads:
-        names = ", ".join(model.payloads) or "none: it has no payloads"
-        faults.append(Fault(("tuned_with",), repr(model.tuned_with), f"one of {names}"))
+        expected = f"one of {_payload_names(model)}"
+        faults.append(Fault(("tuned_with",), repr(model.tuned_with), expected))
     faults += absent_axes(model.faults, n)
     faults += _implausible(model)
-    if faults:
-        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the simulation file")
+    _refuse(document, faults)
+
+
+def _closure_key_faults(model: SimulationModel) -> Iterator[Fault]:
+    """Find keys of closed chains in the file of a robot without closures."""
+    if model.closures:
+        return
+    for key in ("motors", "platform", "assembly_deg", "assembly_mm", "passive"):
+        if getattr(model, key):
+            expected = "closures of a closed chain, or none of its keys"
+            yield Fault((key,), "given without closures", expected)
+
+
+def _ratio_faults(model: SimulationModel) -> Iterator[Fault]:
+    """Find a drive train of another size than the robot."""
+    n = len(model.axes)
+    rows = len(model.ratio)
+    is_square = all(len(row) == n for row in model.ratio)
+    if rows != n or not is_square:
+        yield Fault(("ratio",), f"{rows} rows", f"{n} × {n}, a row for each motor")
+
+
+def _start_faults(model: SimulationModel) -> Iterator[Fault]:
+    """Find start positions that are too many, too few, or both an angle and a length."""
+    n = len(model.axes)
+    angles = len(model.start_deg)
+    lengths = len(model.start_mm)
+    has_angles = bool(model.start_deg) or not model.start_mm
+    if angles != n and has_angles:
+        yield Fault(("start_deg",), f"{angles} angles", f"{n}, one for each joint")
+        return
+    if lengths not in (0, n):
+        yield Fault(("start_mm",), f"{lengths} positions", f"{n}, one for each joint")
+        return
+    key = "start_deg"
+    if model.start_mm:
+        key = "start_mm"
+    for joint, found in enumerate(_starts(model), start=1):
+        if found.count(None) != 1:
+            yield Fault((key,), f"joint {joint}: {found}", "deg, or mm, and null")
+
+
+def _axis_faults(model: SimulationModel) -> Iterator[Fault]:
+    """Find node ids used twice, gains of zero, and effects on axes that the cell lacks."""
+    n = len(model.axes)
+    node_ids = {axis.node_id for axis in model.axes}
+    if len(node_ids) != n:
+        yield Fault(("axes",), "a node id used twice", "each node once")
+    for index, axis in enumerate(model.axes):
+        if axis.gain_nm_per_a == 0.0:
+            place = ("axes", index, "gain_nm_per_a")
+            yield Fault(place, "0", "a gain that is not zero")
+    for index, effect in enumerate(model.effects):
+        if effect.axis is not None and axis_index(effect.axis) >= n:
+            axis_place = ("effects", index, "axis")
+            yield Fault(axis_place, f"axis {effect.axis}", f"J1 to J{n}")
 
 
 def _implausible(model: SimulationModel) -> Iterator[Fault]:
@@ -284,26 +363,41 @@ def _implausible(model: SimulationModel) -> Iterator[Fault]:
     for name, body in model.payloads.items():
         path = ("payloads", name)
         if not within(body.mass_kg, MASS_KG):
-            yield Fault((*path, "mass_kg"), f"{body.mass_kg:g} kg", f"{MASS_KG[0]:g} to {MASS_KG[1]:g} kg")
+            least_kg, most_kg = MASS_KG
+            expected = f"{least_kg:g} to {most_kg:g} kg"
+            yield Fault((*path, "mass_kg"), f"{body.mass_kg:g} kg", expected)
             continue
+        inertia_path = (*path, "inertia_kg_m2")
         yield from centre_faults((*path, "centre_m"), body.centre_m)
-        yield from gyration_faults((*path, "inertia_kg_m2"), body.inertia_kg_m2, body.mass_kg)
-        yield from moment_faults((*path, "inertia_kg_m2"), body.inertia_kg_m2)
+        yield from gyration_faults(inertia_path, body.inertia_kg_m2, body.mass_kg)
+        yield from moment_faults(inertia_path, body.inertia_kg_m2)
     for index, axis in enumerate(model.axes):
-        for key, value, bounds in (
-            ("gain_nm_per_a", abs(axis.gain_nm_per_a) or GAIN[0], GAIN),  # `_check` refuses 0
-            ("rated_current_a", axis.rated_current_a, CURRENT_A),
-            ("peak_current_a", axis.peak_current_a, CURRENT_A),
-        ):
-            if not within(value, bounds):
-                yield Fault(("axes", index, key), f"{value:g}", f"{bounds[0]:g} to {bounds[1]:g} in size")
+        place = ("axes", index)
+        gain = abs(axis.gain_nm_per_a)
+        if gain != 0.0:  # `_axis_faults` finds 0
+            yield from _bound_faults((*place, "gain_nm_per_a"), gain, GAIN)
+        rated_a = axis.rated_current_a
+        peak_a = axis.peak_current_a
+        yield from _bound_faults((*place, "rated_current_a"), rated_a, CURRENT_A)
+        yield from _bound_faults((*place, "peak_current_a"), peak_a, CURRENT_A)
+    _, largest_ratio = RATIO
     for index, row in enumerate(model.ratio):
-        if not all(abs(number) <= RATIO[1] for number in row):
-            yield Fault(("ratio", index), ", ".join(f"{number:g}" for number in row), f"at most ±{RATIO[1]:g}")
+        if not all(abs(number) <= largest_ratio for number in row):
+            numbers = ", ".join(f"{number:g}" for number in row)
+            yield Fault(("ratio", index), numbers, f"at most ±{largest_ratio:g}")
     bounded = {"gain_nm_per_a", "rated_current_a", "peak_current_a"}
-    for where, number in _numbers((), model.model_dump(exclude={"payloads", "ratio"})):
-        if where[-1] not in bounded and not abs(number) <= LARGEST_NUMBER:
+    others = model.model_dump(exclude={"payloads", "ratio"})
+    for where, number in _numbers((), others):
+        if where[-1] in bounded:
+            continue
+        if not abs(number) <= LARGEST_NUMBER:
             yield Fault(where, f"{number:g}", f"at most ±{LARGEST_NUMBER:g}")
+
+
+def _bound_faults(where: Location, value: float, bounds: tuple[float, float]) -> Iterator[Fault]:
+    if not within(value, bounds):
+        least, most = bounds
+        yield Fault(where, f"{value:g}", f"{least:g} to {most:g} in size")
 
 
 def _numbers(path: Location, value: object) -> Iterator[tuple[Location, float]]:
@@ -324,22 +418,33 @@ def _closed_chain_faults(model: SimulationModel, urdf: str) -> Iterator[Fault]:
         root = ElementTree.fromstring(urdf)
     except ElementTree.ParseError:
         return  # the plant says so
-    yield from _link_faults(model, [link.get("name", "") for link in root.iter("link")])
-    kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.iter("joint")}
-    yield from _joint_faults(model, {name: kind for name, kind in kinds.items() if kind != "fixed"})
+    links = [link.get("name", "") for link in root.iter("link")]
+    yield from _link_faults(model, links)
+    kinds = {}
+    for joint in root.iter("joint"):
+        name = joint.get("name", "")
+        kind = joint.get("type", "")
+        if kind != "fixed":
+            kinds[name] = kind
+    yield from _joint_faults(model, kinds)
 
 
 def _link_faults(model: SimulationModel, links: list[str]) -> Iterator[Fault]:
     """Find closures and a platform of links that the URDF lacks, and closures of nothing."""
     wanted = f"a link of the URDF: {', '.join(links)}"
     for number, closure in enumerate(model.closures):
-        for key, link in (("first", closure.first), ("second", closure.second)):
-            if link not in links:
-                yield Fault(("closures", number, key), link, wanted)
-        if closure.first == closure.second:
-            yield Fault(("closures", number, "second"), f"{closure.second} twice", "two links")
-        if len(set(closure.directions)) != len(closure.directions):
-            yield Fault(("closures", number, "directions"), "a direction twice", "each direction once")
+        place = ("closures", number)
+        first = closure.first
+        second = closure.second
+        if first not in links:
+            yield Fault((*place, "first"), first, wanted)
+        if second not in links:
+            yield Fault((*place, "second"), second, wanted)
+        if first == second:
+            yield Fault((*place, "second"), f"{second} twice", "two links")
+        different = set(closure.directions)
+        if len(different) != len(closure.directions):
+            yield Fault((*place, "directions"), "a direction twice", "each direction once")
     if model.platform is not None and model.platform not in links:
         yield Fault(("platform",), model.platform, wanted)
 
@@ -347,16 +452,30 @@ def _link_faults(model: SimulationModel, links: list[str]) -> Iterator[Fault]:
 def _joint_faults(model: SimulationModel, joints: dict[str, str]) -> Iterator[Fault]:
     """Find motors, positions and friction of joints that the URDF lacks, given the kinds of its joints."""
     wanted = f"joints of the URDF: {', '.join(joints)}"
-    unknown = set(model.motors) - set(joints)
-    if unknown or len(set(model.motors)) != len(model.motors) or len(model.motors) != len(model.axes):
-        yield Fault(("motors",), ", ".join(model.motors) or "none", f"{len(model.axes)} different {wanted}")
+    n = len(model.axes)
+    motors = set(model.motors)
+    has_one_each = len(motors) == len(model.motors) == n
+    if not has_one_each or not motors <= set(joints):
+        found = ", ".join(model.motors) or "none"
+        yield Fault(("motors",), found, f"{n} different {wanted}")
     prismatic = {name for name, kind in joints.items() if kind == "prismatic"}
-    for key, there in (("assembly_deg", set(joints) - prismatic), ("assembly_mm", prismatic)):
-        given = set(getattr(model, key))
-        if wrong := sorted(given - there):
-            yield Fault((key,), ", ".join(wrong), f"{'prismatic' if key == 'assembly_mm' else 'revolute'} {wanted}")
-        if missing := sorted(there - given):
-            yield Fault((key,), f"no {', '.join(missing)}", "a rough position of every joint")
+    revolute = set(joints) - prismatic
+    angles = set(model.assembly_deg)
+    lengths = set(model.assembly_mm)
+    yield from _assembly_faults("assembly_deg", angles, revolute, f"revolute {wanted}")
+    yield from _assembly_faults("assembly_mm", lengths, prismatic, f"prismatic {wanted}")
     for name in model.passive:
-        if name not in joints or name in model.motors:
-            yield Fault(("passive", name), "a joint with a motor" if name in joints else name, "a passive joint")
+        if name not in joints:
+            yield Fault(("passive", name), name, "a passive joint")
+        elif name in motors:
+            yield Fault(("passive", name), "a joint with a motor", "a passive joint")
+
+
+def _assembly_faults(key: str, given: set[str], joints: set[str], wanted: str) -> Iterator[Fault]:
+    """Find rough positions of joints of another kind, and joints without one."""
+    wrong = sorted(given - joints)
+    if wrong:
+        yield Fault((key,), ", ".join(wrong), wanted)
+    missing = sorted(joints - given)
+    if missing:
+        yield Fault((key,), f"no {', '.join(missing)}", "a rough position of every joint")

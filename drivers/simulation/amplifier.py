@@ -57,10 +57,10 @@ STATE = (
     "inside_for_s",
 )
 COUNTERS = ("enabled", "piece", "counts")
-STATUS_BITS = ("reached", "limited", "following_error")  #: `limited` is kept for a whole sample period
-LOOP = np.dtype(
-    [*((name, "f8") for name in SETTINGS + STATE), *((name, "i8") for name in COUNTERS + STATUS_BITS)], align=True
-)
+STATUS_BITS = ("reached", "limited", "following_error")  #: `limited` stays set for the rest of a sample period
+_FLOATS = [(name, "f8") for name in SETTINGS + STATE]
+_INTEGERS = [(name, "i8") for name in COUNTERS + STATUS_BITS]
+LOOP = np.dtype([*_FLOATS, *_INTEGERS], align=True)
 """One record an axis; positions in motor counts, velocities in counts/s, accelerations in counts/s²."""
 
 
@@ -138,12 +138,17 @@ def plan(
         distance -= 0.5 * (moving + speed) * slow_s
         moving = speed
     # Distance of accelerating from `moving` to the peak p and stopping: (p² − moving²) / 2a + p² / 2d.
-    peak_squared = (2.0 * distance + moving**2 / acceleration) / (1.0 / acceleration + 1.0 / deceleration)
-    peak = max(moving, min(speed, math.sqrt(max(peak_squared, 0.0))))
-    pieces.append(((peak - moving) / acceleration, sign * acceleration))
-    ramps = (peak**2 - moving**2) / (2.0 * acceleration) + peak**2 / (2.0 * deceleration)
+    squared_speeds = 2.0 * distance + moving**2 / acceleration
+    peak_squared = squared_speeds / (1.0 / acceleration + 1.0 / deceleration)
+    reachable = math.sqrt(max(peak_squared, 0.0))
+    peak = max(moving, min(speed, reachable))
+    accelerate_s = (peak - moving) / acceleration
+    pieces.append((accelerate_s, sign * acceleration))
+    ramp_up = (peak**2 - moving**2) / (2.0 * acceleration)
+    ramps = ramp_up + peak**2 / (2.0 * deceleration)
     if peak > 0.0:
-        pieces.append((max(distance - ramps, 0.0) / peak, 0.0))
+        cruise_s = max(distance - ramps, 0.0) / peak
+        pieces.append((cruise_s, 0.0))
         pieces.append((peak / deceleration, -sign * deceleration))
     return _padded(pieces, target)
 
@@ -151,13 +156,17 @@ def plan(
 def ramp_down(start: float, velocity: float, deceleration: float) -> ProfileMove:
     """Return the move that stops a set-point on a ramp."""
     stop_s = abs(velocity) / deceleration
-    return _padded([(stop_s, math.copysign(deceleration, -velocity))], start + 0.5 * velocity * stop_s)
+    acceleration = math.copysign(deceleration, -velocity)
+    stop = start + 0.5 * velocity * stop_s
+    return _padded([(stop_s, acceleration)], stop)
 
 
 def _padded(pieces: list[tuple[float, float]], target: float) -> ProfileMove:
     used = [piece for piece in pieces if piece[0] > 0.0]
     used += [(0.0, 0.0)] * (SEGMENTS - len(used))
-    return ProfileMove(tuple(p[0] for p in used), tuple(p[1] for p in used), target)
+    durations_s = tuple(duration_s for duration_s, _ in used)
+    accelerations = tuple(acceleration for _, acceleration in used)
+    return ProfileMove(durations_s, accelerations, target)
 
 
 @compiled
@@ -204,7 +213,8 @@ def _move_demand(axis: np.void, piece_s: FloatArray, piece_acceleration: FloatAr
         rest = piece_s[k] - axis["piece_time_s"]
         used = min(left, rest)
         acceleration = piece_acceleration[k]
-        axis["demand"] += axis["demand_velocity"] * used + 0.5 * acceleration * used * used
+        travel = axis["demand_velocity"] * used + 0.5 * acceleration * used * used
+        axis["demand"] += travel
         axis["demand_velocity"] += acceleration * used
         axis["demand_acceleration"] = acceleration
         axis["piece_time_s"] += used
@@ -229,7 +239,7 @@ def _follow(axis: np.void, error: float, step_s: float) -> None:
     limited = abs(current) >= limit
     if limited:
         axis["limited"] = 1
-        current = limit if current > 0.0 else -limit
+        current = math.copysign(limit, current)
     # No wind-up: at the limit the integral may only shrink.
     if not limited or push * current < 0.0:
         axis["integral_a"] += push
@@ -275,11 +285,15 @@ def _fill(loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: Floa
         axis = loops[i]
         # int32 as the bus carries it: an endless axis wraps around.
         readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
-        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
-        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
+        demand = np.int64(np.rint(axis["demand"]))
+        readings[1, i] = (demand + 2**31) % 2**32 - 2**31
+        velocity = np.rint(axis["velocity"])
+        readings[2, i] = np.int64(min(max(velocity, -(2.0**31)), 2.0**31 - 1.0))
         per_mille = 1000.0 / rated_current_a[i]
-        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
-        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
+        current_demand = np.rint(reported_a[i] * per_mille)
+        readings[3, i] = np.int64(min(max(current_demand, -32768.0), 32767.0))
+        current = np.rint(axis["current_a"] * per_mille)
+        readings[4, i] = np.int64(min(max(current, -32768.0), 32767.0))
         readings[5, i] = axis["reached"]
         readings[6, i] = axis["limited"]
         readings[7, i] = axis["following_error"]
@@ -316,12 +330,10 @@ class AmplifierSet:
         built = (build_effect(effect, n) for effect in spec.effects if effect.joint is None)
         self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
-        self._noise = ColouredNoise(
-            random_streams(spec.seed, n),
-            np.array([axis.current_noise_a for axis in spec.axes]),
-            np.array([axis.noise_correlation_s for axis in spec.axes]),
-            period_s,
-        )
+        sigma_a = np.array([axis.current_noise_a for axis in spec.axes])
+        correlation_s = np.array([axis.noise_correlation_s for axis in spec.axes])
+        streams = random_streams(spec.seed, n)
+        self._noise = ColouredNoise(streams, sigma_a, correlation_s, period_s)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self.readings = self._read()  #: renewed once a SYNC
 
@@ -336,7 +348,9 @@ class AmplifierSet:
     def report(self) -> None:
         """Renew the reported currents and the readings, once a SYNC."""
         self.actual_a[:] = self.loops["current_a"]
-        current_a = self._lagged_a if self._lags else self.loops["current_a"]
+        current_a = self.actual_a
+        if self._lags:
+            current_a = self._lagged_a
         np.add(current_a, self._noise.advance(), out=self.reported_a)
         self.readings = self._read()
 

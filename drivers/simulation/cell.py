@@ -17,7 +17,7 @@ from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
-from drivers.simulation.node import Node
+from drivers.simulation.node import Node, Send
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, SpecInvalid
 
@@ -69,7 +69,9 @@ class SyncGate:
     def arrive(self, bus: int) -> Cycles:
         """Count a SYNC that is not late."""
         self._waiting[bus] += 1
-        return self.close() if self._waiting[bus] > PATIENCE else self._complete()
+        if self._waiting[bus] > PATIENCE:
+            return self.close()
+        return self._complete()
 
     def close(self) -> Cycles:
         """Stop waiting for the buses without SYNC."""
@@ -145,12 +147,15 @@ class SimulatedCell:
         self._clock = clock
         self._burst: list[can.Message] | None = None
         self._disturbance = Disturbance(spec.faults)
-        self.nodes = tuple(
-            Node(index, axis, self._amplifiers, partial(self._send_of, index) if spec.faults else self._send)
-            for index, axis in enumerate(spec.axes)
-        )
-        self._wires, there = _wires(bus, ids)
-        self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
+        nodes = []
+        for index, axis in enumerate(spec.axes):
+            send: Send = self._send
+            if spec.faults:
+                send = partial(self._send_of, index)
+            nodes.append(Node(index, axis, self._amplifiers, send))
+        self.nodes = tuple(nodes)
+        self._wires, ids_of_wires = _wires(bus, ids)
+        self._on_wire = tuple(self._nodes_of(wire_ids) for wire_ids in ids_of_wires)
         self._gate = SyncGate(len(self._wires))
         _refuse_error_frames(spec.faults, bus)
         for index, node in enumerate(self.nodes):
@@ -163,7 +168,7 @@ class SimulatedCell:
         self._failure: Exception | None = None
 
     def __enter__(self) -> SimulatedCell:
-        self._thread = threading.Thread(target=self._serve_and_keep, name="simulated cell", daemon=True)
+        self._thread = threading.Thread(target=self._serve_in_thread, name="simulated cell", daemon=True)
         self._thread.start()
         return self
 
@@ -211,6 +216,9 @@ class SimulatedCell:
             if message is None and self._disturbance:
                 self._interfere()  # other masters do not wait for our SYNC
 
+    def _nodes_of(self, ids: Collection[int]) -> tuple[Node, ...]:
+        return tuple(node for node in self.nodes if node.node_id in ids)
+
     def _next_frame(self) -> can.Message | None:
         message = None
         try:
@@ -218,12 +226,15 @@ class SimulatedCell:
         except BusError:
             if not self._goes_on():
                 raise
-        if self._mounted is not None and not any(node.drive.state in POWERED for node in self.nodes):
+        if self._mounted is not None and not self._is_powered():
             spec = self._mounted()
             if spec is not None and spec is not self._spec:
                 self._spec = spec
                 self.plant.mount(spec)
         return message
+
+    def _is_powered(self) -> bool:
+        return any(node.drive.state in POWERED for node in self.nodes)
 
     def _goes_on(self) -> bool:
         """Return whether another bus works after one has failed."""
@@ -234,14 +245,16 @@ class SimulatedCell:
         """Plant time since power-on [us]."""
         return self.cycles * self._spec.sync_period_us
 
-    def _serve_and_keep(self) -> None:
+    def _serve_in_thread(self) -> None:
         try:
             self.serve_forever()
-        except Exception as error:  # noqa: BLE001 - kept whole and raised again in the thread that owns the cell
+        except Exception as error:  # noqa: BLE001 - raised again in the thread that owns the cell
             self._failure = error
 
     def _receive(self, message: can.Message) -> None:
-        wire = self._wires.index(str(message.channel)) if len(self._wires) > 1 else 0
+        wire = 0
+        if len(self._wires) > 1:
+            wire = self._wires.index(str(message.channel))
         if message.arbitration_id == SYNC_ID:
             self._receive_sync(wire)
             return
@@ -260,7 +273,9 @@ class SimulatedCell:
             self._advance(())
             moving = any(node.drive.powered and node.drive.moving for node in self.nodes)
             lone.cycles = lone.cycles + 1
-            lone.rested = 0 if moving else lone.rested + 1
+            lone.rested = lone.rested + 1
+            if moving:
+                lone.rested = 0
             if lone.rested * period_s >= LONE_REST_S:
                 lone = self._lone = None
 
@@ -279,9 +294,12 @@ class SimulatedCell:
         for index, node in enumerate(self.nodes):
             if self._disturbance.active(FaultKind.SDO_MASTER, index):
                 self._send(0x600 + node.node_id, FOREIGN_SDO)
-        masters = (FaultKind.SECOND_MASTER, FaultKind.SYNC_PRODUCER)
-        if any(self._disturbance.active(kind, index) for kind in masters for index in range(len(self.nodes))):
+        if self._has(FaultKind.SECOND_MASTER) or self._has(FaultKind.SYNC_PRODUCER):
             self._send(SYNC_ID, b"")
+
+    def _has(self, kind: FaultKind) -> bool:
+        """Whether a fault is active on any axis."""
+        return any(self._disturbance.active(kind, index) for index in range(len(self.nodes)))
 
     def _begin_faults(self) -> None:
         """Apply the faults that begin with this cycle, before the plant moves."""
@@ -293,13 +311,16 @@ class SimulatedCell:
                     node.strike(fault, self._clock())
             if fault.kind in ERROR_FRAMES:
                 error_class, data = ERROR_FRAMES[fault.kind]
-                self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))
+                error_frame = can.Message(is_error_frame=True, arbitration_id=error_class, data=data)
+                self._bus.send(error_frame)
 
     def _advance(self, wires: Collection[int]) -> None:
         """Run one cycle; the nodes on these buses received a SYNC."""
         plant = self.plant
         amplifiers = self._amplifiers
-        synchronised = [node for wire in sorted(wires) for node in self._on_wire[wire]]
+        synchronised: list[Node] = []
+        for wire in sorted(wires):
+            synchronised += self._on_wire[wire]
         for node in synchronised:
             node.begin_cycle()
         if self._disturbance:
@@ -363,11 +384,10 @@ def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], t
 
 def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
     """Refuse error frames that the bus cannot carry: they would end the cell in the middle of a run."""
-    hub = (
-        any(part.address.kind.has_server for part in bus.address.parts)
-        if isinstance(bus, SplitBus)
-        else isinstance(bus, SocketcandBus)
-    )
+    if isinstance(bus, SplitBus):
+        hub = any(part.address.kind.has_server for part in bus.address.parts)
+    else:
+        hub = isinstance(bus, SocketcandBus)
     error_frame_faults = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
     if hub and error_frame_faults:
         raise SpecInvalid(

@@ -73,7 +73,11 @@ def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray
     """Compute φ, shape (c,), and J_c, shape (c, n), in place at the first n positions."""
     tree = Tree(*constants)
     joints = len(tree.parent)
-    placed = Placed(np.zeros((joints, 3, 3)), np.zeros((joints, 3)), np.zeros((joints, 3)), np.zeros((joints, 3)))
+    rotation = np.zeros((joints, 3, 3))
+    origin = np.zeros((joints, 3))
+    slide = np.zeros((joints, 3))
+    turn = np.zeros((joints, 3))
+    placed = Placed(rotation, origin, slide, turn)
     for a in range(3):
         placed.rotation[0, a, a] = 1.0
     for i in tree.outwards:
@@ -175,7 +179,9 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
             spin[a, b] = 0.5 * ((trace if a == b else 0.0) - between[a, b])
     _add(to_first, apart, error[:3])
     for side in range(2):
-        sign = 1.0 if side == 1 else -1.0
+        sign = -1.0
+        if side == 1:
+            sign = 1.0
         j = tree.frame_joint[k, side]
         while j > 0:
             velocity = np.empty(3)
@@ -235,7 +241,9 @@ def eliminate(matrix: FloatArray, rank: int, held: BoolArray, pivots: IntArray) 
             if k != i and factor != 0.0:
                 for j in range(n + 1):
                     matrix[k, j] -= factor * matrix[i, j]
-    return smallest / largest if rank > 0 else 1.0
+    if rank > 0:
+        return smallest / largest
+    return 1.0
 
 
 @compiled
@@ -337,7 +345,8 @@ class Mechanism:
         self.constants: tuple[Any, ...] = tuple(tree)
         self._closed_directions = tree.closed
         motors = len(spec.motors)
-        assembled = self.closed(np.array([spec.assembly_rad[name] for name in self.joints]), (motors, 0))
+        rough = np.array([spec.assembly_rad[name] for name in self.joints])
+        assembled = self.closed(rough, (motors, 0))
         self.mobility = len(ids) - _rank(self.at(assembled)[1])
         self.start_rad = self._started(spec, assembled)
         jacobian = self.at(self.start_rad)[1]
@@ -347,7 +356,8 @@ class Mechanism:
                 f"{self.mobility} degrees of freedom; expected at least 1 and at most the {motors} motors; correct "
                 "closures or motors"
             )
-        directions = np.linalg.svd(jacobian)[2][-self.mobility :].T[:motors]
+        _, _, rows = np.linalg.svd(jacobian)
+        directions = rows[-self.mobility :].T[:motors]
         if _rank(directions) < self.mobility:
             raise SpecInvalid(
                 f"motors: {', '.join(spec.motors)} move {_rank(directions)} of {self.mobility} degrees of freedom at "
@@ -419,12 +429,14 @@ class Mechanism:
         """Return the closed position that continues the assembly to the start of the motors, shape (n,)."""
         motors = len(spec.motors)
         # The rounded positions of redundant motors agree only nearly, so that these move as well.
-        held = (motors, 0) if motors > self.mobility else (motors,)
+        fixed: tuple[int, ...] = (motors,)
+        if motors > self.mobility:
+            fixed = (motors, 0)
         position = assembled.copy()
         begin = position[:motors].copy()
         for share in np.linspace(0.0, 1.0, ASSEMBLY_LEAPS + 1)[1:]:
             position[:motors] = begin + share * (spec.start_rad - begin)
-            position = self.closed(position, held)
+            position = self.closed(position, fixed)
         apart = np.abs(position[:motors] - spec.start_rad)
         if apart.max() > START_TOLERANCE:
             worst = int(apart.argmax())
@@ -460,11 +472,14 @@ def _refuse_wrong_names(joints: Sequence[str], spec: CellSpec) -> None:
             raise SpecInvalid(
                 f"{key}: the URDF has no joint {', '.join(unknown)}; expected some of {', '.join(joints)}"
             )
-    if len(set(spec.motors)) != len(spec.motors) or len(spec.motors) != len(spec.axes):
-        raise SpecInvalid(f"motors: {len(set(spec.motors))} joints for {len(spec.axes)} axes; name one for each axis")
-    if missing := sorted(set(joints) - set(spec.assembly_rad)):
+    different = len(set(spec.motors))
+    if different != len(spec.motors) or different != len(spec.axes):
+        raise SpecInvalid(f"motors: {different} joints for {len(spec.axes)} axes; name one for each axis")
+    missing = sorted(set(joints) - set(spec.assembly_rad))
+    if missing:
         raise SpecInvalid(f"assembly: no position of {', '.join(missing)}; give a rough one of every joint")
-    if driven := sorted(set(spec.passive) & set(spec.motors)):
+    driven = sorted(set(spec.passive) & set(spec.motors))
+    if driven:
         raise SpecInvalid(f"passive: {', '.join(driven)} has a motor; its friction belongs to its axis")
 
 
@@ -485,17 +500,22 @@ def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
     for k, closure in enumerate(spec.closures):
         frames += [link_frame(model, closure.first), link_frame(model, closure.second)]
         closed += [(k, number) for number, direction in enumerate(DIRECTIONS) if direction in closure.directions]
+    parents = [place[model.parents[joint]] for joint in with_base]
+    # Two frames a closure.
+    frame_joint = np.array([place[frame.parentJoint] for frame in frames], dtype=np.int64)
+    frame_rotation = np.array([frame.placement.rotation for frame in frames])
+    frame_offset = np.array([frame.placement.translation for frame in frames])
     return Tree(
-        parent=np.array([place[model.parents[joint]] for joint in with_base], dtype=np.int64),
+        parent=np.array(parents, dtype=np.int64),
         # Pinocchio numbers a joint after its parent.
         outwards=1 + np.argsort(ids).astype(np.int64),
-        rotation=np.array([p.rotation for p in placements]),
-        offset=np.array([p.translation for p in placements]),
+        rotation=np.array([placement.rotation for placement in placements]),
+        offset=np.array([placement.translation for placement in placements]),
         slide=np.where(sliding, motion[:, :3], 0.0),
         turn=np.where(sliding, 0.0, motion[:, 3:]),
-        frame_joint=np.array([place[frame.parentJoint] for frame in frames], dtype=np.int64).reshape(-1, 2),
-        frame_rotation=np.array([frame.placement.rotation for frame in frames]).reshape(-1, 2, 3, 3),
-        frame_offset=np.array([frame.placement.translation for frame in frames]).reshape(-1, 2, 3),
+        frame_joint=frame_joint.reshape(-1, 2),
+        frame_rotation=frame_rotation.reshape(-1, 2, 3, 3),
+        frame_offset=frame_offset.reshape(-1, 2, 3),
         closed=np.array(closed, dtype=np.int64),
     )
 

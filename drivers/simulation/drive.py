@@ -33,23 +33,31 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
     after: PowerState
     if state is PowerState.FAULT:
         reset = controlword & 0x80 and not previous & 0x80
-        after = PowerState.SWITCH_ON_DISABLED if reset else state
+        after = state
+        if reset:
+            after = PowerState.SWITCH_ON_DISABLED
     elif state in (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.FAULT_REACTION_ACTIVE):
         after = state
     elif not controlword & 0x02:  # disable voltage: transitions 7, 9, 10, 12
         after = PowerState.SWITCH_ON_DISABLED
     elif state is PowerState.QUICK_STOP_ACTIVE:
         again = controlword & 0x0F == 0x0F and stays_in_quick_stop  # 16
-        after = PowerState.OPERATION_ENABLED if again else state
+        after = state
+        if again:
+            after = PowerState.OPERATION_ENABLED
     elif not controlword & 0x04:  # quick stop: 7, 10, 11
         running = state is PowerState.OPERATION_ENABLED
-        after = PowerState.QUICK_STOP_ACTIVE if running else PowerState.SWITCH_ON_DISABLED
+        after = PowerState.SWITCH_ON_DISABLED
+        if running:
+            after = PowerState.QUICK_STOP_ACTIVE
     elif not controlword & 0x01:  # shutdown: 2, 6, 8
         after = PowerState.READY_TO_SWITCH_ON
     elif state is PowerState.SWITCH_ON_DISABLED:
         after = state  # switch on needs READY TO SWITCH ON first
     else:  # switch on (3, 5); enable operation (4, and from READY TO SWITCH ON through SWITCHED ON, which is allowed)
-        after = PowerState.OPERATION_ENABLED if controlword & 0x08 else PowerState.SWITCHED_ON
+        after = PowerState.SWITCHED_ON
+        if controlword & 0x08:
+            after = PowerState.OPERATION_ENABLED
     return after
 
 
@@ -149,7 +157,8 @@ class Drive:
         readings = self._amplifiers.readings
         word = self.state.value | 0x0210  # voltage present, remote
         if self.powered:
-            word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
+            limited = readings.limited[self._index] | self.limited
+            word |= readings.reached[self._index] << 10 | limited << 11
         if self._acknowledged:
             word |= 0x1000
         if self.error is ErrorCode.FOLLOWING_ERROR:
@@ -193,7 +202,9 @@ class Drive:
         if controlword & 0x40:
             target += int(self._axis["target"])
         self._acknowledged = True
-        speed, acceleration, deceleration = (float(self._number(index)) for index in (0x6081, 0x6083, 0x6084))
+        speed = float(self._number(0x6081))
+        acceleration = float(self._number(0x6083))
+        deceleration = float(self._number(0x6084))
         setpoint = (float(target), speed, acceleration, deceleration)
         if moving and not controlword & 0x20:
             self._waiting = setpoint

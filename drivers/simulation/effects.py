@@ -48,7 +48,8 @@ Effect = Callable[[Moment], None]  #: Changes the moment; called once a substep
 
 def stribeck(moment: Moment, axis: int, rise_nm: float, speed_rad_s: float) -> None:
     """Stribeck friction Fs + rise·exp(−|v|/speed): larger near standstill than sliding (Bo and Pavelescu 1982)."""
-    moment.bound_nm[axis] += rise_nm * math.exp(-abs(moment.velocity_rad_s[axis]) / speed_rad_s)
+    speed = abs(moment.velocity_rad_s[axis])
+    moment.bound_nm[axis] += rise_nm * math.exp(-speed / speed_rad_s)
 
 
 def load_friction(moment: Moment, axis: int, coefficient: float) -> None:
@@ -64,7 +65,10 @@ def efficiency(moment: Moment, axis: int, efficiency: float) -> None:
     velocity = moment.velocity_rad_s[axis]
     rubbing = moment.bound_nm[axis] + moment.viscous_nm_s_rad[axis] * abs(velocity)
     along = moment.load_torque_nm[axis] * math.copysign(1.0, velocity) + rubbing
-    moment.bound_nm[axis] += along * (1.0 / efficiency - 1.0) if along > 0.0 else -along * (1.0 - efficiency)
+    loss_nm = -along * (1.0 - efficiency)
+    if along > 0.0:
+        loss_nm = along * (1.0 / efficiency - 1.0)
+    moment.bound_nm[axis] += loss_nm
 
 
 def nonlinear_viscous(moment: Moment, axis: int, torque_at_1_rad_s_nm: float, exponent: float) -> None:
@@ -77,7 +81,9 @@ def nonlinear_viscous(moment: Moment, axis: int, torque_at_1_rad_s_nm: float, ex
 
 def asymmetric_viscous(moment: Moment, axis: int, coefficient_nm_s_rad: float) -> None:
     """Viscous friction Fv + c forwards and Fv − c backwards, never below zero: a torque −c·|v| beside −Fv·v."""
-    change = coefficient_nm_s_rad if moment.velocity_rad_s[axis] >= 0.0 else -coefficient_nm_s_rad
+    change = -coefficient_nm_s_rad
+    if moment.velocity_rad_s[axis] >= 0.0:
+        change = coefficient_nm_s_rad
     moment.viscous_nm_s_rad[axis] = max(0.0, moment.viscous_nm_s_rad[axis] + change)
 
 
@@ -102,7 +108,8 @@ def counterbalance(
     joint's axis. (A hydropneumatic one differs by its gas law.)
     """
     x = moment.position_rad[axis] - phase_rad
-    length_m = math.sqrt(base_m**2 + lever_m**2 - 2.0 * base_m * lever_m * math.cos(x))
+    squared_m2 = base_m**2 + lever_m**2 - 2.0 * base_m * lever_m * math.cos(x)
+    length_m = math.sqrt(squared_m2)
     force_n = preload_n + stiffness_n_per_m * (length_m - abs(base_m - lever_m))
     moment.torque_nm[axis] -= force_n * base_m * lever_m * math.sin(x) / length_m
 
@@ -115,7 +122,8 @@ def position_friction(moment: Moment, axis: int, amplitude_nm: float, phase_rad:
 
 def cogging(moment: Moment, axis: int, amplitude_nm: float, order: float, phase_rad: float = 0.0) -> None:
     """Cogging torque −amplitude·sin(order·θ + phase) of the motor, θ its rotor angle; the amplitude in joint units."""
-    moment.motor_torque_nm[axis] -= amplitude_nm * math.sin(order * moment.motor_rad[axis] + phase_rad)
+    angle_rad = order * moment.motor_rad[axis] + phase_rad
+    moment.motor_torque_nm[axis] -= amplitude_nm * math.sin(angle_rad)
 
 
 def saturation(moment: Moment, axis: int, half_current_a: float) -> None:
@@ -123,7 +131,8 @@ def saturation(moment: Moment, axis: int, half_current_a: float) -> None:
 
     To first order the current that a torque needs is v = v₀ + v₀³/half_current², v₀ = τ/g.
     """
-    moment.motor_torque_nm[axis] /= 1.0 + (moment.current_a[axis] / half_current_a) ** 2
+    share = moment.current_a[axis] / half_current_a
+    moment.motor_torque_nm[axis] /= 1.0 + share**2
 
 
 def clipped_current(moment: Moment, axis: int, limit_a: float) -> None:
@@ -175,9 +184,11 @@ class TemperatureFriction:
         ):
             friction[axis] *= max(0.0, 1.0 + 0.01 * percent * above_k)
         losses_w = self.winding_ohm * moment.current_a[axis] ** 2
-        losses_w += (moment.bound_nm[axis] + moment.viscous_nm_s_rad[axis] * speed) * speed
+        friction_nm = moment.bound_nm[axis] + moment.viscous_nm_s_rad[axis] * speed
+        losses_w += friction_nm * speed
         end_k = self.resistance_k_per_w * losses_w
-        above_k = end_k + (above_k - end_k) * math.exp(-moment.step_s / self.time_constant_s)
+        left = math.exp(-moment.step_s / self.time_constant_s)
+        above_k = end_k + (above_k - end_k) * left
         moment.temperature_c[axis] = AMBIENT_C + above_k
 
 
@@ -198,7 +209,9 @@ class Presliding:
         velocity = moment.velocity_rad_s[self.axis]
         if velocity != 0.0:
             end = math.copysign(1.0, velocity)
-            self.bristle = end + (self.bristle - end) * math.exp(-abs(velocity) * moment.step_s / self.distance_rad)
+            way_rad = abs(velocity) * moment.step_s
+            left = math.exp(-way_rad / self.distance_rad)
+            self.bristle = end + (self.bristle - end) * left
         moment.bound_nm[self.axis] = max(0.0, moment.bound_nm[self.axis] - self.torque_nm)
         moment.torque_nm[self.axis] -= self.torque_nm * self.bristle
 
@@ -221,7 +234,8 @@ class Coupling:
     def __call__(self, moment: Moment) -> None:
         """Set the bound of the shared friction and add its viscous part."""
         moment.bound_nm[self.direction] += self.coulomb_nm
-        shared = self.viscous_nm_s_rad * (moment.velocity_rad_s[self.axis] + moment.velocity_rad_s[self.other])
+        velocity_rad_s = moment.velocity_rad_s[self.axis] + moment.velocity_rad_s[self.other]
+        shared = self.viscous_nm_s_rad * velocity_rad_s
         moment.torque_nm[self.axis] -= shared
         moment.torque_nm[self.other] -= shared
 
@@ -262,7 +276,8 @@ class Cable:
     def __call__(self, moment: Moment) -> None:
         """Take the cable's force from both joints."""
         other = int(self.other_axis) - 1
-        way_m = self.radius_m * moment.position_rad[self.axis] + self.other_radius_m * moment.position_rad[other]
+        own_way_m = self.radius_m * moment.position_rad[self.axis]
+        way_m = own_way_m + self.other_radius_m * moment.position_rad[other]
         force_n = self.stiffness_n_per_m * self.stretch_m(way_m)
         moment.torque_nm[self.axis] -= self.radius_m * force_n
         moment.torque_nm[other] -= self.other_radius_m * force_n
@@ -327,7 +342,9 @@ class Lag:
 
     def report(self, reported_a: FloatArray, step_s: float) -> None:
         """Replace this axis' reference by the filtered one; called once a substep (exact for a held input)."""
-        self.value_a += (float(reported_a[self.axis]) - self.value_a) * -np.expm1(-step_s / self.time_constant_s)
+        difference_a = float(reported_a[self.axis]) - self.value_a
+        share = -np.expm1(-step_s / self.time_constant_s)
+        self.value_a += difference_a * share
         reported_a[self.axis] = self.value_a
 
 
@@ -398,11 +415,16 @@ def _require_parameters(effect: UndeclaredEffect, physics: Callable[..., object]
     Raises:
         SpecInvalid: with all of them, and those that there are.
     """
-    known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in PLACES}
+    parameters = signature(physics).parameters.values()
+    known = {parameter.name: parameter.default for parameter in parameters if parameter.name not in PLACES}
     unknown = sorted(set(effect.parameters) - set(known))
-    missing = [name for name, default in known.items() if default is Parameter.empty and name not in effect.parameters]
-    wrong = [f"unknown parameter {', '.join(unknown)}"] if unknown else []
-    wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
+    required = [name for name, default in known.items() if default is Parameter.empty]
+    missing = [name for name in required if name not in effect.parameters]
+    wrong = []
+    if unknown:
+        wrong.append(f"unknown parameter {', '.join(unknown)}")
+    if missing:
+        wrong.append(f"missing parameter {', '.join(missing)}")
     if wrong:
         raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
 
@@ -438,7 +460,8 @@ def build_effect(effect: UndeclaredEffect, axes: int, passive: tuple[str, ...] =
         raise SpecInvalid(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
     _require_parameters(effect, physics)
     other_axis = effect.parameters.get("other_axis")
-    if other_axis is not None and (other_axis not in range(1, axes + 1) or other_axis == joint + 1):
+    others = set(range(1, axes + 1)) - {joint + 1}
+    if other_axis is not None and other_axis not in others:
         raise SpecInvalid(f"{effect.name}: other_axis {other_axis:g} is not another axis from 1 to {axes}")
     if not isinstance(physics, type):
         return partial(physics, axis=joint, **effect.parameters)

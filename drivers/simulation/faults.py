@@ -14,7 +14,7 @@ class FaultKind(Enum):
     SILENT = "silent"  # neither sends nor receives: no power, cable off
     NO_HEARTBEAT = "no-heartbeat"
     FROZEN = "frozen"  # TPDOs repeat position and current: a dead encoder
-    STALE = "stale"  # TPDOs are repeated whole: a processor that hangs behind its bus
+    STALE = "stale"  # TPDOs are repeated unchanged: a processor that hangs behind its bus
     LIMIT = "limit"  # statusword bit 11
     LOST = "lost"  # no TPDOs
     LATE = "late"  # TPDOs arrive with the next SYNC
@@ -22,9 +22,9 @@ class FaultKind(Enum):
     SHORT_PDO = "short-pdo"  # TPDOs lack their last byte
     WRONG_COB_ID = "wrong-cob-id"  # TPDOs have the identifier of TPDO4
     SHIFTED = "shifted"  # TPDOs carry another position than 6064h
-    SECOND_MASTER = "second-master"  # SYNC from another master, whole cell
+    SECOND_MASTER = "second-master"  # SYNC from another master, every axis
     SDO_MASTER = "sdo-master"  # SDO requests from another master
-    BUS_OFF = "bus-off"  # error frame, then no frame passes, whole cell
+    BUS_OFF = "bus-off"  # error frame, then no frame passes, every axis
     # From power-on.
     SYNC_PRODUCER = "sync-producer"  # the amplifier sends a SYNC by itself
     REFUSES_NMT = "refuses-nmt"  # does not go to OPERATIONAL
@@ -39,7 +39,7 @@ class FaultKind(Enum):
     FALLS_BACK = "falls-back"  # PRE-OPERATIONAL with EMCY 8130h
     REBOOTS = "reboots"  # boot-up message, settings lost
     LOSES_POWER = "loses-power"  # SWITCH ON DISABLED, as after STO
-    ERROR_PASSIVE = "error-passive"  # error frame: the controller counts too many errors, whole cell
+    ERROR_PASSIVE = "error-passive"  # error frame: the controller counts too many errors, every axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,9 @@ class FaultSpec:
 
     def active(self, cycle: int) -> bool:
         """Return whether the fault is present in a cycle."""
-        return self.at_cycle <= cycle and (self.cycles is None or cycle < self.at_cycle + self.cycles)
+        if cycle < self.at_cycle:
+            return False
+        return self.cycles is None or cycle < self.at_cycle + self.cycles
 
     def concerns(self, axis: int) -> bool:
         """Return whether the fault affects an axis."""
@@ -78,7 +80,7 @@ class Disturbance:
     def __init__(self, faults: Sequence[FaultSpec]) -> None:
         self._faults = tuple(faults)
         self.cycle = 0
-        self._held: list[Frame] = []
+        self._late: list[Frame] = []
         self._frozen: dict[int, bytes] = {}
 
     def __bool__(self) -> bool:
@@ -102,33 +104,44 @@ class Disturbance:
         if self.cut_off(axis):
             return []
         frame = (identifier, data)
-        if identifier == 0x700 + node_id:
-            return [] if self.active(FaultKind.NO_HEARTBEAT, axis) else [frame]
+        if identifier == 0x700 + node_id and self.active(FaultKind.NO_HEARTBEAT, axis):
+            return []
         if identifier != 0x180 + node_id:
             return [frame]
+        return self._sent_pdo(axis, node_id, data)
+
+    def _sent_pdo(self, axis: int, node_id: int, data: bytes) -> list[Frame]:
+        """Return the frames that reach the bus when a node sends its first PDO."""
         if self.active(FaultKind.LOST, axis):
             return []
+        identifier = 0x180 + node_id
+        frame = (identifier, data)
         frozen = self.active(FaultKind.FROZEN, axis)
         stale = self.active(FaultKind.STALE, axis)
         if frozen or stale:
-            kept = self._frozen.setdefault(axis, data)
-            frame = (identifier, kept if stale else kept[:_FROZEN_BYTES] + data[_FROZEN_BYTES:])
+            first = self._frozen.setdefault(axis, data)
+            frame = (identifier, first)
+            if not stale:
+                frame = (identifier, first[:_FROZEN_BYTES] + data[_FROZEN_BYTES:])
         else:
             self._frozen.pop(axis, None)
         if self.active(FaultKind.SHIFTED, axis):
             position = int.from_bytes(data[:4], "little", signed=True) + 100_000
-            frame = (identifier, (position & 0xFFFF_FFFF).to_bytes(4, "little") + data[4:])
+            shifted = (position & 0xFFFF_FFFF).to_bytes(4, "little")
+            frame = (identifier, shifted + data[4:])
         if self.active(FaultKind.SHORT_PDO, axis):
             frame = (identifier, data[:-1])
         if self.active(FaultKind.WRONG_COB_ID, axis):
             frame = (0x480 + node_id, data)
         if self.active(FaultKind.LATE, axis):
-            self._held.append(frame)
+            self._late.append(frame)
             return []
-        return [frame, frame] if self.active(FaultKind.DUPLICATE, axis) else [frame]
+        if self.active(FaultKind.DUPLICATE, axis):
+            return [frame, frame]
+        return [frame]
 
     def release(self) -> list[Frame]:
-        """Return the TPDOs held back since the previous SYNC."""
-        held = self._held
-        self._held = []
-        return held
+        """Return the TPDOs delayed since the previous SYNC."""
+        late = self._late
+        self._late = []
+        return late

@@ -28,7 +28,9 @@ FULL_BYTES = 64 << 10  #: About 1500 frames, 50 ms of a simulated cell
 # Possessive: each byte is read a bounded number of times, so that no line takes long.
 _COMMAND = re.compile(rb"<\s*+(?:send ([0-9A-Fa-f]++) ([0-9A-Fa-f]++)([0-9A-Fa-f ]*+)|([^<>]*+))>")
 _MAX_COMMAND_BYTES = 256
-_BASE_DIGITS, _EXTENDED_DIGITS = 3, 8  #: Hexadecimal digits of an identifier of 11 and of 29 bits
+#: Hexadecimal digits of an identifier of 11 and of 29 bits
+_BASE_DIGITS = 3
+_EXTENDED_DIGITS = 8
 _LONGEST_DATA = 8  #: Bytes of a CAN frame
 _REMEDIES = {
     errno.EADDRINUSE: ": another hub runs on this port; use that one, end it, or choose another port (0: a free one)",
@@ -62,12 +64,12 @@ class Hub:
     def __enter__(self) -> Self:
         self._loop = asyncio.new_event_loop()
         try:
-            self._server = self._loop.run_until_complete(
-                self._loop.create_server(lambda: _Client(self), HOST, self._port)
-            )
+            starting = self._loop.create_server(lambda: _Client(self), HOST, self._port)
+            self._server = self._loop.run_until_complete(starting)
         except OSError as error:
             self._loop.close()
-            reason = (error.strerror or str(error)) + _REMEDIES.get(error.errno or 0, "")
+            remedy = _REMEDIES.get(error.errno or 0, "")
+            reason = f"{error.strerror or error}{remedy}"
             raise BusError(f"hub {HOST}:{self._port}", reason) from error
         self._thread = threading.Thread(target=self._loop.run_forever, name="socketcand hub", daemon=True)
         self._thread.start()
@@ -138,7 +140,9 @@ class _Client(asyncio.Protocol):
 
     def _throttle(self) -> None:
         """Read this client only while there is room for what it sends."""
-        cell = None if self._channel is None else self._hub.cells.get(self._channel)
+        cell = None
+        if self._channel is not None:
+            cell = self._hub.cells.get(self._channel)
         waits_for_cell = cell is not None and cell is not self and cell._full
         if waits_for_cell or (self._full and self._answered):
             self._transport.pause_reading()
@@ -153,7 +157,7 @@ class _Client(asyncio.Protocol):
             self.drop()
 
     def _say(self, answers: list[bytes]) -> None:
-        """Write answers of the hub itself at once: asyncio counts all that waits anew with each write."""
+        """Write answers of the hub itself at once: asyncio counts all that waits again with each write."""
         if answers:
             self._answered = True
             self._write(b"".join(answers))
@@ -188,7 +192,9 @@ class _Client(asyncio.Protocol):
 
     def _answer_to(self, command: bytes | None) -> bytes:
         """Do what a command says, and return the answer; None is a frame that is sent before the raw mode."""
-        words = b"send" if command is None else command[:_MAX_COMMAND_BYTES]
+        words = b"send"
+        if command is not None:
+            words = command[:_MAX_COMMAND_BYTES]
         word, _, argument = words.decode("ascii", "replace").strip().partition(" ")
         if word == "open" and self._raw:
             return b"< error a bus is open >"

@@ -86,7 +86,9 @@ class Node:
         self._beat_wall_s = 0.0
         self._heard_wall_s: float | None = None
         self._toggle = 0
-        self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
+        self._toggle_mask = 0
+        if axis.toggle_bit is not None:
+            self._toggle_mask = 1 << axis.toggle_bit
         self._refused: set[int] = set()
         self._obeys_nmt = True
 
@@ -151,7 +153,10 @@ class Node:
         # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
         allowed_ms = self._values[0x1016, 1] & 0xFFFF
         heard_s = self._heard_wall_s
-        lost = bool(allowed_ms) and heard_s is not None and (wall_s - heard_s) * 1e3 >= allowed_ms
+        lost = False
+        if allowed_ms and heard_s is not None:
+            silent_ms = (wall_s - heard_s) * 1e3
+            lost = silent_ms >= allowed_ms
         if lost or not allowed_ms:
             self._heard_wall_s = None
         if lost:
@@ -160,7 +165,9 @@ class Node:
         period_ms = self._values[0x1017, 0]
         if period_ms == 0 or self.nmt is NmtState.INITIALISING:
             return lost
-        if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
+        since_us = now_us - self._beat_us
+        since_wall_ms = (wall_s - self._beat_wall_s) * 1e3
+        if since_us >= 1000 * period_ms or since_wall_ms >= period_ms:
             self._beat_us = now_us
             self._beat_wall_s = wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
@@ -252,7 +259,9 @@ class Node:
     def _transmit_pdos(self, due: Callable[[Pdo, int], bytes | None]) -> None:
         if self.nmt is NmtState.OPERATIONAL:
             for pdo in self._transmit:
-                data = due(pdo, self._now_us) if pdo.valid else None
+                data = None
+                if pdo.valid:
+                    data = due(pdo, self._now_us)
                 if data is not None:
                     self._send(pdo.can_id, data)
 
@@ -272,7 +281,9 @@ class Node:
         """
         pdo = self._pdo(index)
         if pdo is not None:
-            return pdo.read_mapping(subindex) if index & 0x200 else pdo.read_communication(subindex)
+            if index & 0x200:
+                return pdo.read_mapping(subindex)
+            return pdo.read_communication(subindex)
         entry = find(self._dictionary, index, subindex)
         if (index, subindex) == (0x1003, 1) and not self._history:
             raise SdoAbort(0x08000024)  # no data available
@@ -304,7 +315,9 @@ class Node:
             if value != (SAVE if index == STORE else LOAD):
                 raise SdoAbort(NOT_STORED)
             # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
-            self.saved = self._stored() if index == STORE else self._defaults
+            self.saved = self._defaults
+            if index == STORE:
+                self.saved = self._stored()
         elif index == 0x1003:
             self._history.clear()
         else:
@@ -313,7 +326,9 @@ class Node:
     def _pdo(self, index: int) -> Pdo | None:
         if not 0x1400 <= index <= 0x1BFF:
             return None
-        side = self._transmit if index >= 0x1800 else self._receive
+        side = self._receive
+        if index >= 0x1800:
+            side = self._transmit
         number = index & 0x1FF
         if number >= len(side):
             raise SdoAbort(NO_OBJECT)
@@ -338,9 +353,17 @@ class Node:
             0x60F4: lambda: amplifiers.readings.demand[i] - amplifiers.readings.position[i],
         }
         index, subindex = key
+        if index == 0x1003 and subindex:
+            return self._last_error
         if index == 0x1003:
-            return lambda: (self._history[0] if self._history else 0) if subindex else len(self._history[:1])
+            return lambda: len(self._history[:1])
         return self._signals.get(key) or live.get(index, lambda: self._number(index, subindex))
+
+    def _last_error(self) -> int:
+        """Return object 1003h:01."""
+        if self._history:
+            return self._history[0]
+        return 0
 
     def _number(self, index: int, subindex: int = 0) -> int:
         return self._values[index, subindex]

@@ -26,7 +26,11 @@ class ColouredNoise:
     """
 
     def __init__(
-        self, streams: Sequence[np.random.Generator], sigma: FloatArray, correlation_s: FloatArray, step_s: float
+        self,
+        streams: Sequence[np.random.Generator],
+        sigma: FloatArray,
+        correlation_s: FloatArray,
+        step_s: float,
     ) -> None:
         """Draw the first values.
 
@@ -47,13 +51,19 @@ class ColouredNoise:
     def advance(self) -> FloatArray:
         """Return the next value of each process, shape (n,)."""
         if self._used == len(self._block):
-            self._block = np.stack([stream.standard_normal(BLOCK) for stream in self._streams], axis=1)
+            columns = [stream.standard_normal(BLOCK) for stream in self._streams]
+            self._block = np.stack(columns, axis=1)
             self._used = 0
-        self.value = self._memory * self.value + self._drive * self._block[self._used]
+        white = self._block[self._used]
+        self.value = self._memory * self.value + self._drive * white
         self._used += 1
         return self.value
 
 
 def random_streams(seed: int, axes: int, *kind: int) -> list[np.random.Generator]:
     """Return a stream for each axis: its noise depends neither on the other axes nor on noise of another kind."""
-    return [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(axis, *kind))) for axis in range(axes)]
+    streams = []
+    for axis in range(axes):
+        sequence = np.random.SeedSequence(seed, spawn_key=(axis, *kind))
+        streams.append(np.random.default_rng(sequence))
+    return streams

@@ -38,7 +38,9 @@ class Kind(Enum):
     @property
     def bits(self) -> int:
         """Width in bits; 0 for text."""
-        return 0 if self is Kind.TEXT else 8 * struct.calcsize("<" + self.value)
+        if self is Kind.TEXT:
+            return 0
+        return 8 * struct.calcsize("<" + self.value)
 
     def encode(self, value: int) -> bytes:
         """Return the bytes for the bus."""
@@ -82,7 +84,9 @@ class Entry:
 
     def accepts(self, value: int) -> bool:
         """Return whether a value is in its range."""
-        return (self.lowest is None or value >= self.lowest) and (self.highest is None or value <= self.highest)
+        if self.lowest is not None and value < self.lowest:
+            return False
+        return self.highest is None or value <= self.highest
 
     def decode(self, data: bytes) -> int:
         """Return the value of bytes from the bus.
@@ -221,7 +225,8 @@ class SdoServer:
     def _start_upload(self, _: bytes) -> bytes:
         data = self._read(*self._entry)
         if len(data) <= 4:
-            return _HEAD.pack(0x43 | (4 - len(data)) << 2, *self._entry) + data.ljust(4, b"\0")
+            unused = 4 - len(data)
+            return _HEAD.pack(0x43 | unused << 2, *self._entry) + data.ljust(4, b"\0")
         self._upload = data
         self._toggle = 0
         return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
@@ -232,14 +237,19 @@ class SdoServer:
         self._check_toggle(request)
         part = self._upload[:7]
         rest = self._upload[7:]
-        answer = bytes([self._toggle | (7 - len(part)) << 1 | (not rest)]) + part.ljust(7, b"\0")
+        unused = 7 - len(part)
+        is_last = not rest
+        head = self._toggle | unused << 1 | is_last
+        answer = bytes([head]) + part.ljust(7, b"\0")
         self._toggle ^= 0x10
         self._upload = rest or None
         return answer
 
     def _start_download(self, request: bytes) -> bytes:
         if request[0] & 0x02:
-            size = 4 - (request[0] >> 2 & 3) if request[0] & 0x01 else 4
+            size = 4
+            if request[0] & 0x01:
+                size = 4 - (request[0] >> 2 & 3)
             self._write(*self._entry, request[4 : 4 + size])
         else:
             self._download = bytearray()
@@ -250,7 +260,8 @@ class SdoServer:
         if self._download is None:
             raise SdoAbort(UNKNOWN_COMMAND)
         self._check_toggle(request)
-        self._download += request[1 : 8 - (request[0] >> 1 & 7)]
+        unused = request[0] >> 1 & 7
+        self._download += request[1 : 8 - unused]
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= 0x10
         if request[0] & 0x01:
@@ -278,8 +289,17 @@ class CurrentObject(NamedTuple):
     def source(self, amplifiers: AmplifierSet, index: int) -> Callable[[], int]:
         """Return a function that reads the value of one amplifier."""
         highest = 2 ** (self.kind.bits - 1) - 1
-        signal_a = amplifiers.reported_a if self.is_reference else amplifiers.actual_a
-        return lambda: max(-highest - 1, min(highest, round(float(signal_a[index]) / self.step_a)))
+        signal_a = amplifiers.actual_a
+        if self.is_reference:
+            signal_a = amplifiers.reported_a
+        lowest = -highest - 1
+
+        def read() -> int:
+            value = round(float(signal_a[index]) / self.step_a)
+            limited: int = max(lowest, min(highest, value))
+            return limited
+
+        return read
 
 
 class Vendor(NamedTuple):

@@ -94,7 +94,8 @@ class Pdo:
         self.parameters = parameters
         entries = parameters.entries[: parameters.count]
         self.mapped = tuple((entry >> 16, entry >> 8 & 0xFF) for entry in entries)
-        self.layout = struct.Struct("<" + "".join(self._dictionary[key].kind.value for key in self.mapped))
+        kinds = [self._dictionary[key].kind.value for key in self.mapped]
+        self.layout = struct.Struct("<" + "".join(kinds))
         self._getters = tuple(self._source(key) for key in self.mapped)
 
     def on_sync(self, now_us: int) -> bytes | None:
@@ -120,7 +121,9 @@ class Pdo:
         if parameters.transmission < EVENT_DRIVEN:
             return None
         data = self._data()
-        since_us = None if self._last_us is None else now_us - self._last_us
+        since_us = None
+        if self._last_us is not None:
+            since_us = now_us - self._last_us
         timer = parameters.event_timer_ms and since_us is not None and since_us >= 1000 * parameters.event_timer_ms
         if data == self._last and not timer:
             return None

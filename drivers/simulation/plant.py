@@ -30,6 +30,19 @@ BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its mot
 DISTURBANCE = 1  #: Kind of the random streams of the torque disturbance; those of the current noise have none
 
 
+def _brake_nm(axis: AxisSpec) -> float:
+    """Torque of the brake of an axis."""
+    return BRAKE_FACTOR * abs(axis.gain_nm_per_a) * axis.peak_current_a
+
+
+def _only_joint(direction: FloatArray) -> int:
+    """Return the joint that a direction moves alone; -1 where it moves several."""
+    joints = np.flatnonzero(direction)
+    if len(joints) == 1:
+        return int(joints[0])
+    return -1
+
+
 def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tuple[Mechanics, tuple[Elasticity, ...]]:
     """Assign coordinates and directions, and set them in the effects that add some.
 
@@ -76,12 +89,15 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
             effect.direction = len(directions)
             effect.row = np.concatenate((effect.row, np.zeros(total - joints)))
             directions.append(effect.row)
-    lone = [np.flatnonzero(row)[0] if np.count_nonzero(row) == 1 else -1 for row in directions]
+    lone = [_only_joint(row) for row in directions]
+    rotor_direction = motor_direction * reduction(spec.ratio)[:, None]
+    motor_inertia = np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])
+    motor_viscous = np.array([axis.motor_viscous_nm_s_rad for axis in spec.axes])
     mechanics = Mechanics(
         motor_direction=motor_direction,
-        rotor_direction=motor_direction * reduction(spec.ratio)[:, None],
-        motor_inertia=np.array([axis.motor_inertia_kg_m2 for axis in spec.axes]),
-        motor_viscous=np.array([axis.motor_viscous_nm_s_rad for axis in spec.axes]),
+        rotor_direction=rotor_direction,
+        motor_inertia=motor_inertia,
+        motor_viscous=motor_viscous,
         directions=np.array(directions),
         own_row=own_row,
         lone=np.array(lone, dtype=np.int64),
@@ -137,15 +153,7 @@ class Plant:
         self.mount(spec)
         n = len(spec.axes)
         self.mechanism = Mechanism(self._model, spec) if spec.closures else None
-        if (
-            (self.mechanism is None and self._model.nv != n)
-            or spec.ratio.shape != (n, n)
-            or spec.start_rad.shape != (n,)
-        ):
-            raise SpecInvalid(
-                f"{n} axes, a URDF of {self._model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
-                f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
-            )
+        self._require_one_size(spec)
         start_rad = spec.start_rad
         mobility = n
         passive_joints: tuple[str, ...] = ()
@@ -163,7 +171,8 @@ class Plant:
         with_friction: list[AxisSpec | PassiveFriction] = [*spec.axes]
         with_friction += [spec.passive.get(name, PassiveFriction()) for name in passive_joints]
         self.time_s = 0.0
-        self.position_rad = np.concatenate([start_rad, [drive.row @ start_rad[:n] for drive in flexible]])
+        flexible_rad = [drive.row @ start_rad[:n] for drive in flexible]
+        self.position_rad = np.concatenate([start_rad, flexible_rad])
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(self._joints)
         self.motor_rad = np.zeros(n)
@@ -179,7 +188,7 @@ class Plant:
         self._free_bound = np.zeros(m)
         self._free_bound[: self._joints] = [joint.coulomb_nm for joint in with_friction]
         np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in spec.axes])
-        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in spec.axes])
+        self._brake_nm = np.array([_brake_nm(axis) for axis in spec.axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
             time_s=0.0,
@@ -204,6 +213,22 @@ class Plant:
         self._disturbance = _disturbance(spec, self._mechanics.step_s)
         self._refuse_stiff(flexible, spec)
         self.set_brakes(np.ones(n, dtype=np.bool_))
+
+    def _require_one_size(self, spec: CellSpec) -> None:
+        """Refuse a URDF, a drive train and a start position of different numbers of axes.
+
+        Raises:
+            SpecInvalid: they are.
+        """
+        n = len(spec.axes)
+        joints = self._model.nv
+        # A closed chain has passive joints as well.
+        fits = self.mechanism is not None or joints == n
+        if not fits or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
+            raise SpecInvalid(
+                f"{n} axes, a URDF of {joints} joints, a drive train of shape {spec.ratio.shape} and a start "
+                f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
+            )
 
     def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
         """Build the undeclared effects; pivots with friction learn how they turn with the joints.
@@ -270,10 +295,13 @@ class Plant:
         upper = self._model.upperPositionLimit
         # Pinocchio has a joint type for each sliding axis, as JointModelPX, or JointModelPrismaticUnaligned.
         sliding = [str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]]
-        return tuple(
-            np.linspace(lower[joint], upper[joint], count) if sliding[joint] else start + angles
-            for joint, start in enumerate(start_rad)
-        )
+        postures = []
+        for joint, start in enumerate(start_rad):
+            posture = start + angles
+            if sliding[joint]:
+                posture = np.linspace(lower[joint], upper[joint], count)
+            postures.append(posture)
+        return tuple(postures)
 
     def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
         """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (m,).
@@ -330,10 +358,12 @@ class Plant:
         position[self._order] = self.position_rad[:n]
         velocity[self._order] = self.velocity_rad_s[:n]
         moment = self._moment
+        mass = self._mass(self._model, self._data, self.position_rad[:n])
+        bias_nm = pin.nonLinearEffects(self._model, self._data, position, velocity)
         step = (
             self._constants,
-            self._mass(self._model, self._data, self.position_rad[:n]),
-            pin.nonLinearEffects(self._model, self._data, position, velocity)[self._order],
+            mass,
+            bias_nm[self._order],
             moment.viscous_nm_s_rad,
             moment.motor_torque_nm,
             moment.torque_nm,
@@ -369,7 +399,8 @@ class Plant:
 def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
     """Return the random torque on each motor in joint units [Nm], None for a cell without any."""
     rated_nm = np.array([abs(axis.gain_nm_per_a) * axis.rated_current_a for axis in spec.axes])
-    sigma_nm = 0.01 * np.array([axis.torque_disturbance_percent for axis in spec.axes]) * rated_nm
+    percent = np.array([axis.torque_disturbance_percent for axis in spec.axes])
+    sigma_nm = 0.01 * percent * rated_nm
     if not sigma_nm.any():
         return None
     correlation_s = np.array([axis.disturbance_correlation_s for axis in spec.axes])
