@@ -94,6 +94,7 @@ if TYPE_CHECKING:  # the names of a module stand together
         PlacedEffect as PlacedEffect,
         Property as Property,
         Range as Range,
+        Reported as Reported,
     )
     from ident.effects.signals import (
         Abscissa as Abscissa,

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray, as_array, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
-from ident.effects.effect import ADDED, ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
+from ident.effects.effect import ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
 from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
 from ident.effects.own import known_effect, known_names
 from ident.effects.rotor import beside_rotors
@@ -258,7 +258,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     axis = 0 if everywhere else places.index(accepted.axis)
     if not known.has_axis and axis:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; it acts on {ALL_AXES}")
-    added = {name: 0.0 for name in known.settings if name in ADDED and name not in accepted.settings}
+    added = {name: 0.0 for name in known.added_settings if name not in accepted.settings}
     own, accepted = accepted.settings, replace(accepted, settings={**accepted.settings, **added})
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (own, known.settings))

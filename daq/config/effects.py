@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from daq.config.yaml_file import Fault
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import ADDED, Effect, GearSide, PlacedEffect, check_settings, is_placeable
+from ident.effects.effect import Effect, GearSide, PlacedEffect, check_settings, is_placeable
 from ident.effects.own import installed_families
 from ident.errors import EffectRefused
 from ident.model.robot import Robot
@@ -28,7 +28,7 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
     unknown = sorted(set(settings) - set(known.settings))
     if unknown:
         return Fault(("settings",), f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
-    added = {name: 0 for name in known.settings if name in ADDED}  # a file of an earlier version does not have them
+    added = dict.fromkeys(known.added_settings, 0)  # a file of an earlier version does not have them
     full = {**known.settings, **added, **settings}
     for setting, value in full.items():
         # A file has one kind of number; an order is whole.

@@ -12,7 +12,7 @@ from daq.report.gains import with_deviation
 from daq.report.text import SHOWN_SIGMAS
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration, Parameter
-from ident.effects.effect import Effect, PlacedEffect, is_shipped
+from ident.effects.effect import Effect, PlacedEffect, Reported, is_shipped
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, Periodic, Smooth, is_unnamed
 from ident.errors import EffectRefused
@@ -66,8 +66,6 @@ _WHERE = {
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
 """Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
-_ANGLES = frozenset({"offset", "turn 1", "turn 2"})
-"""Coefficients of the geometry that a technician reads in degrees."""
 _POINTS = 61
 
 
@@ -134,7 +132,7 @@ def size_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
     """
     placed = _placed(accepted, calibration)
     if placed is None:
-        return ", ".join(_sized("coefficient", one) for one in accepted.coefficients)
+        return ", ".join(_sized("coefficient", one, Reported.COEFFICIENTS) for one in accepted.coefficients)
     if (curve := curve_of(accepted, calibration)) is not None:
         return curve.text
     return named_size(placed.effect, _in_order(accepted, placed))
@@ -146,20 +144,20 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
     where = _WHERE.get(effect.name, "").format(**effect.settings)
     if not is_shipped(effect):
         where = ", ".join(f"{name} {value:.4g}" for name, value in effect.settings.items())
-    if names == ["cosine", "sine"]:
+    if effect.reported is Reported.AMPLITUDE:
         cosine, sine = found
         amplitude = math.hypot(cosine.value, sine.value)
         std = math.hypot(cosine.value * cosine.std, sine.value * sine.std) / (amplitude or 1.0)
         sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
-    elif effect.settings.get("with_rotor"):
+    elif effect.fits_rotor:
         loss, rest = found
         # It follows its rest until this is small against σ: where that is large, the sum may be below zero.
-        inertia = max(0.0, effect.settings["rotor_inertia_kg_m2"] + rest.value / (loss.value or math.inf))
+        inertia = max(0.0, effect.known_rotor_kg_m2 + rest.value / (loss.value or math.inf))
         std = rest.std / (abs(loss.value) or math.inf)
         rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
-        sizes = f"{_sized(names[0], loss)}, {rotor}"
+        sizes = f"{_sized(names[0], loss, effect.reported)}, {rotor}"
     else:
-        sizes = ", ".join(_sized(name, one) for name, one in zip(names, found, strict=True))
+        sizes = ", ".join(_sized(name, one, effect.reported) for name, one in zip(names, found, strict=True))
     if where:
         return f"{sizes}, {where}"
     return sizes
@@ -204,19 +202,19 @@ def _in_order(accepted: AcceptedEffect, placed: PlacedEffect) -> list[Parameter]
     return [by_name[column.name] for column in placed.columns]
 
 
-def _sized(name: str, one: Parameter) -> str:
-    if one.unit == "rad" and name in _ANGLES:
+def _sized(name: str, one: Parameter, reported: Reported) -> str:
+    if reported is Reported.ANGLES and one.unit == "rad":  # a zero of a prismatic joint is in metres
         return f"{name} {with_deviation(math.degrees(one.value), math.degrees(one.std))}°"
-    if one.unit == "Nm/Nm":
+    if reported is Reported.SHARE_OF_LOAD:
         return f"{with_deviation(100.0 * one.value, 100.0 * one.std)} % of the load torque"
-    if one.unit == "s":
+    if reported is Reported.DELAY:
         return f"{with_deviation(1e3 * one.value, 1e3 * one.std)} ms"
     return f"{name} {with_deviation(one.value, one.std)} {one.unit}"
 
 
 def other_axis(effect: Effect) -> int | None:
     """Index of the second axis of an effect on two axes."""
-    number = effect.settings.get("other_axis", 0)
-    if number:
-        return int(number) - 1
-    return None
+    number = effect.second_axis
+    if number is None:
+        return None
+    return number - 1

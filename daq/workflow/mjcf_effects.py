@@ -19,7 +19,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
-from ident.effects.effect import Effect
+from ident.effects.effect import Effect, is_shipped
 from ident.effects.friction import PassiveFriction
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.effects.position import PassiveSpring, Spring
@@ -122,7 +122,12 @@ def _joint_of(place: int, robot: Robot) -> int | None:
 
 
 def _numbers_of(effect: Effect, coefficients: FloatArray) -> FloatArray | None:
-    """Stiffness, rest, damping and dry friction of an effect; None of one that joints do not have."""
+    """Stiffness, rest, damping and dry friction of an effect; None of one that joints do not have.
+
+    A class of one's own that derives from one of these has columns of its own.
+    """
+    if not is_shipped(effect):
+        return None
     match effect:
         case Spring() if coefficients[0] > 0.0:
             return np.array([coefficients[0], 0.0, 0.0, 0.0])

@@ -237,7 +237,7 @@ def _all_resettled(model: JointFit) -> JointFit:
 def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
     """Return an effect of a joint fit with the settings that are fitted refined around it."""
     effect, axis, estimate = placed.effect, placed.axis, model.evidence.estimate
-    if effect.settings.get("with_rotor"):
+    if effect.fits_rotor:
         own = own_unknowns(estimate, (placed,))
         fitted = estimate.parameters[own], estimate.parameters_std[own]
         return refined_rotor(model.search_problem, effect, axis, *fitted)

@@ -29,11 +29,6 @@ SETTLED_SHARE = 0.01  #: Of the largest inertia, a step after which the joint fi
 CLOSE_ENOUGH = 0.1  #: Standard deviations of the inertia below which a step no longer matters
 
 
-def has_rotor_form(effect: Effect) -> bool:
-    """Whether an effect is a loss that grows with the load."""
-    return "with_rotor" in effect.settings
-
-
 def axes_with_rotor_in_load(observation: Observation) -> tuple[int, ...]:
     """Indices of the axes whose predicted load contains the rotor's torque, because links move the same way."""
     model, base = observation.model, observation.base
@@ -58,7 +53,7 @@ def propose_rotors(
         families: the dictionary.
         proposed: what is proposed for each axis already; it is kept.
     """
-    losses = [family for family in families if has_rotor_form(family[0])]
+    losses = [family for family in families if family[0].has_rotor_form]
     found = dict(proposed)
     for axis in axes_with_rotor_in_load(search_problem.observation) if losses else ():
         for family in losses:
@@ -90,9 +85,9 @@ def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequenc
         EffectRefused: a rotor's inertia is declared where the load does not contain the rotor.
     """
     effect = placed.effect
-    if not has_rotor_form(effect):
+    if not effect.has_rotor_form:
         return (placed,)
-    given = effect.settings["rotor_inertia_kg_m2"] > 0.0 or effect.settings["with_rotor"]
+    given = effect.known_rotor_kg_m2 > 0.0 or effect.fits_rotor
     contains_rotor = placed.axis in axes_with_rotor_in_load(observation)
     if given and not contains_rotor:
         raise EffectRefused(
@@ -149,7 +144,7 @@ def refined_rotor(
         coefficients: of the fit, c and d, shape (2,).
         deviations: their σ, shape (2,).
     """
-    before_kg_m2 = effect.settings["rotor_inertia_kg_m2"]
+    before_kg_m2 = effect.known_rotor_kg_m2
     if impossible(effect.coefficients[1:], coefficients[1:], deviations[1:]):
         return effect.with_settings({"with_rotor": 0})
     largest_kg_m2 = largest_inertia(search_problem, axis)

@@ -35,7 +35,7 @@ from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProbl
 from ident.discovery.few_moves import FEW_MOVES, FEWEST_MOVES, ByMove, is_tested_on_others, moves_behind, what_to_record
 from ident.discovery.gates import SIGMAS, Gates, certain_delays, impossible
 from ident.discovery.refinement import refine_together
-from ident.effects.effect import FORMS, Effect, PlacedEffect, fits_data, is_placeable
+from ident.effects.effect import Effect, PlacedEffect, fits_data, is_placeable
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
 from ident.effects.own import search_families
 from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
@@ -48,8 +48,6 @@ CABLE_MORE = 0.15
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
 GOLDEN_STEPS = 6  #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
-DECLARED = {"exponent": (0.8, 1.25)}
-"""Settings between which an effect is nearly a declared one: friction with exponent one is viscous."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -205,19 +203,19 @@ def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
     """Whether an effect of the position of one joint of a cable's pair explains nearly as much as the cable."""
     if not isinstance(found.effect, Spring | Hinge | Compensator | Counterbalance):
         return False
-    pair = (cable.axis, int(cable.effect.settings["other_axis"]) - 1)
+    pair = (cable.axis, (cable.effect.second_axis or 0) - 1)
     return found.axis in pair and cable.held_out_fall < (1.0 + CABLE_MORE) * found.held_out_fall
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
-    """Identify an effect on an axis by its family, integer settings and order: two orders of a ripple are two."""
-    own = _own_settings(effect)
-    return effect.name, axis, tuple(value for name, value in own.items() if isinstance(value, int) or name == "order")
+    """Identify an effect on an axis by its family and `Effect.key_settings`: two orders of a ripple are two."""
+    settings = effect.settings
+    return effect.name, axis, tuple(settings[name] for name in effect.key_settings)
 
 
 def _own_settings(effect: Effect) -> dict[str, float]:
     """Settings without those that choose a form of the same effect."""
-    return {name: value for name, value in effect.settings.items() if name not in FORMS}
+    return {name: value for name, value in effect.settings.items() if name not in effect.form_settings}
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
@@ -250,9 +248,11 @@ def refine_setting(
         place = grid.index(value) if value in grid else 0
         if 0 < place < len(grid) - 1 and grid[0] > 0:
             lower, upper = grid[place - 1], grid[place + 1]
-            if name in DECLARED:
-                below, above = DECLARED[name]
-                lower, upper = (lower, min(upper, below)) if value < below else (max(lower, above), upper)
+            declared = effect.nearly_declared.get(name)
+            if declared is not None and value < declared.least:
+                upper = min(upper, declared.least)
+            elif declared is not None:
+                lower = max(lower, declared.largest)
             return _golden_section(search_problem, effect, axis, name, lower, upper)
     return effect
 
@@ -343,7 +343,7 @@ def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     Two that are nearly collinear each hide in their σ, however certain both together are. What is left of a rotor may
     be zero within its σ: it is fitted to say how well the rotor is known.
     """
-    is_richer = len(effect.coefficients) > fewest and not effect.settings.get("with_rotor")
+    is_richer = len(effect.coefficients) > fewest and not effect.fits_rotor
     tolerance = 0.0 if is_richer else SIGMAS
     return impossible(effect.coefficients, trial.coefficients, trial.deviations, tolerance)
 

@@ -56,6 +56,16 @@ class Property(Enum):
     TURNS_THE_ARM = "is the change of the whole arm's torque by another geometry"
 
 
+class Reported(Enum):
+    """How reports give the size of an effect."""
+
+    COEFFICIENTS = "each coefficient with its name and unit"
+    AMPLITUDE = "one amplitude of its two coefficients, of the cosine and the sine of one angle"
+    SHARE_OF_LOAD = "the first coefficient as a share of the load torque, in percent"
+    DELAY = "the coefficient as a time, in milliseconds"
+    ANGLES = "angles in degrees"
+
+
 @dataclass(frozen=True, slots=True)
 class Range:
     """Values that a searched parameter can have: far beyond what a search tries, short of an overflow."""
@@ -65,7 +75,7 @@ class Range:
 
 
 Switch = Annotated[int, Range(0, 1)]
-Sense = Annotated[int, Range(-1, 1)]
+Sense = Annotated[int, Range(-1, 1)]  #: 1 or −1 (`sense_fault`)
 AxisNumber = Annotated[int, Range(0, math.inf)]  #: Number of another axis, from 1; 0 where an effect has none
 
 
@@ -78,9 +88,10 @@ class Effect(ABC):
     needs more current in the positive direction. Its fields, each with a `Range`, are its searched parameters, with
     units in their names. Its docstring states equation, sign, source and signature: how the residual shows it.
 
-    The other properties say where and when it is tried; their defaults are those of a torque on one driven joint. A
-    search tries it where a package registers it by the entry point group `drivegain.effects`, or where it is in
-    `own_effects` of `find_effects`.
+    The other properties say where and when it is tried, and what its settings mean; their defaults are those of a
+    torque on one driven joint. No name of a setting or a coefficient has a meaning by itself. A search tries it where a
+    package registers it by the entry point group `drivegain.effects`, or where it is in `own_effects` of
+    `find_effects`.
 
     Example::
 
@@ -152,15 +163,86 @@ class Effect(ABC):
         return True
 
     @property
+    def reported(self) -> Reported:
+        """How reports give its size."""
+        return Reported.COEFFICIENTS
+
+    @property
+    def axis_setting(self) -> str:
+        """Name of the setting that is the number of another axis, from 1; empty where there is none.
+
+        Of a torque on two joints it is `other_axis`, unless it says otherwise.
+        """
+        return "other_axis" if self.side is GearSide.TWO_JOINTS else ""
+
+    @property
+    def second_axis(self) -> int | None:
+        """Number of the other axis, from 1; None where it has none."""
+        return int(self.settings[self.axis_setting]) or None if self.axis_setting else None
+
+    @property
+    def form_settings(self) -> tuple[str, ...]:
+        """Settings that choose a form of one effect: a search counts an effect in two forms as one."""
+        return ()
+
+    @property
+    def key_settings(self) -> tuple[str, ...]:
+        """Settings in which two effects of one name on one axis must differ for a model to have both.
+
+        All whole numbers that choose no form: cogging of two orders is two effects.
+        """
+        whole = (name for name, value in self.settings.items() if isinstance(value, int))
+        return tuple(name for name in whole if name not in self.form_settings)
+
+    @property
+    def added_settings(self) -> tuple[str, ...]:
+        """Settings that a later version of the effect added.
+
+        Where a calibration does not have them they are 0, and names of columns leave a 0 out.
+        """
+        return ()
+
+    @property
+    def nearly_declared(self) -> Mapping[str, Range]:
+        """Values of a setting, by its name, with which the effect is nearly a term that the model has.
+
+        A refinement stays outside of them, on the side where it begins.
+        """
+        return {}
+
+    @property
+    def settings_fault(self) -> str:
+        """What is wrong with its settings together, to follow "effect 'x' is given"; empty where nothing is."""
+        return ""
+
+    @property
+    def has_rotor_form(self) -> bool:
+        """Whether it is a loss at a gear that can leave the rotor out of the load (`ident.effects.rotor`).
+
+        Its settings `rotor_inertia_kg_m2` and `with_rotor` are then J, and 1 where the rest of it is fitted.
+        """
+        return False
+
+    @property
+    def fits_rotor(self) -> bool:
+        """Whether its last coefficient is the rest of the rotor's inertia, the loss times Ia − J."""
+        return self.has_rotor_form and bool(self.settings["with_rotor"])
+
+    @property
+    def known_rotor_kg_m2(self) -> float:
+        """Inertia of the axis' rotor that it takes off the load [kg m²]; 0 where it knows none."""
+        return self.settings["rotor_inertia_kg_m2"] if self.has_rotor_form else 0.0
+
+    @property
     def refined(self) -> tuple[str, ...]:
         """Settings that are fitted together with the whole model; the values that a family has are where to begin.
 
-        Of an effect of one's own, all real settings where it has two or more: kept at a value that somebody gave, they
-        would leave a rest that other effects explain, and σ would not know it. Without names here, the first positive
-        one that has smaller and larger values in the family is refined between them, once it was chosen.
+        All real settings where it has two or more: kept at a value that somebody gave, they would leave a rest that
+        other effects explain, and σ would not know it. Without names here, the first positive one that has smaller and
+        larger values in the family is refined between them, once it was chosen.
         """
         real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
-        return real if len(real) > 1 and not is_shipped(self) else ()
+        return real if len(real) > 1 else ()
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
@@ -206,6 +288,11 @@ class Effect(ABC):
         return replace(self, **settings)
 
 
+def sense_fault(sense: int) -> str:
+    """What is wrong with a sense, for `Effect.settings_fault`; empty of 1 and −1."""
+    return "" if sense else "sense = 0; it is 1 or -1"
+
+
 def setting_range(effect: Effect, setting: str) -> Range:
     """Return the values that a setting of an effect can have."""
     return _ranges(type(effect))[setting]
@@ -242,14 +329,10 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
             raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
     for setting, allowed in _ranges(type(effect)).items():
         value = settings[setting]
-        is_of_two = effect.side is GearSide.TWO_JOINTS or effect.abscissa is Abscissa.OTHER_VELOCITY
-        if setting == "other_axis" and not is_of_two:
-            if value != 0:
-                raise EffectRefused(f"effect {name!r} is given other_axis = {value:g}; it has no other axis: 0")
-        elif setting == "other_axis":
+        if setting == effect.axis_setting:
             if value not in range(1, axes + 1) or value == axis + 1:
                 raise EffectRefused(
-                    f"effect {name!r} on axis {axis + 1} is given other_axis = {value:g}; it is the number of another "
+                    f"effect {name!r} on axis {axis + 1} is given {setting} = {value:g}; it is the number of another "
                     f"of the {axes} axes"
                 )
         elif not allowed.least <= settings[setting] <= allowed.largest:
@@ -257,32 +340,9 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
                 f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between {allowed.least:g} and "
                 f"{allowed.largest:g}"
             )
-    if settings.get("sense") == 0:
-        raise EffectRefused(f"effect {name!r} is given sense = 0; it is 1 or -1")
-    if "lower" in settings and not settings["lower"] < settings["upper"]:
-        raise EffectRefused(
-            f"effect {name!r} is given the range {settings['lower']:g} to {settings['upper']:g}; it must not be empty"
-        )
+    if fault := effect.with_settings(settings).settings_fault:
+        raise EffectRefused(f"effect {name!r} is given {fault}")
 
-
-ADDED = frozenset(
-    {
-        "half_gap_rad",
-        "resonant_rad_nm",
-        "damping_ratio",
-        "held",
-        "sags",
-        "two_terms",
-        "filter_s",
-        "backwards",
-        "rotor_inertia_kg_m2",
-        "with_rotor",
-    }
-)
-"""Settings that calibrations of an earlier version do not have; they mean 0, and names of columns leave a 0 out."""
-
-FORMS = frozenset({"held", "sags", "two_terms", "backwards", "rotor_inertia_kg_m2", "with_rotor"})
-"""Settings that choose a form of one effect: a search counts an effect in two forms as one."""
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
@@ -300,14 +360,16 @@ class PlacedEffect:
 
     def name_among(self, axes: Sequence[str]) -> str:
         """Name of effect and place: `load-friction on J3`, `coupling on J4 with J5`."""
-        other = int(self.effect.settings.get("other_axis", 0))
+        other = self.effect.second_axis
         return f"{self.effect.name} on {self.axis_name(axes)}" + (f" with {axes[other - 1]}" if other else "")
 
     @property
     def columns(self) -> tuple[Column, ...]:
         """Linear parameters named after effect, axis and settings, because an axis may have cogging of two orders."""
         name, number = self.effect.name, self.axis + 1
-        given = {key: value for key, value in self.effect.settings.items() if value or key not in ADDED}
+        given = {
+            key: value for key, value in self.effect.settings.items() if value or key not in self.effect.added_settings
+        }
         settings = ", ".join(f"{key} {value:.6g}" for key, value in given.items())
         suffix = f" ({settings})" if settings else ""
         return tuple(
@@ -411,7 +473,9 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
         return columns
     if effect.side is GearSide.ALL_MOTORS:
         return np.asarray(np.einsum("ij,ipk->jpk", drive_train.direction, columns))
-    joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is GearSide.TWO_JOINTS else [axis]
+    joints = [axis]
+    if effect.side is GearSide.TWO_JOINTS and effect.second_axis is not None:
+        joints.append(effect.second_axis - 1)
     torque = np.zeros((len(drive_train.ratio), *columns.shape[-2:]))
     torque[joints] = columns
     return torque
@@ -432,7 +496,9 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
 
 def _is_pair(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether the other axis of an effect of two joints comes behind this one, within its reach."""
-    other_axis = int(effect.settings["other_axis"])
+    other_axis = effect.second_axis
+    if other_axis is None:
+        return False
     if effect.reach is not None and other_axis > axis + 1 + effect.reach:
         return False
     return axis + 1 < other_axis <= robot.axis_count

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
-from ident.effects.effect import Effect, GearSide, Property, Range, Switch
+from ident.effects.effect import Effect, GearSide, Property, Range, Reported, Switch
 from ident.effects.signals import Abscissa, Signals, watched_s
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -34,6 +34,8 @@ class Saturation(Effect):
     side = GearSide.MOTOR
     declares = Property.ODD_IN_CURRENT
     abscissa = Abscissa.CURRENT
+    form_settings = ("two_terms",)
+    added_settings = ("two_terms",)
 
     two_terms: Switch = 0  #: 1 with the term of fifth order, else 0
 
@@ -67,6 +69,7 @@ class Cogging(Effect):
     declares = Property.PERIODIC_IN_MOTOR_ANGLE
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
+    reported = Reported.AMPLITUDE
 
     order: Annotated[int, Range(1, 1000)]  #: k, per motor revolution
 
@@ -120,6 +123,9 @@ class Lag(Effect):
     declares = Property.RATE_OF_TORQUE
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s", least=-EARLIEST_S),)
+    reported = Reported.DELAY
+    form_settings = ("backwards",)
+    added_settings = ("filter_s", "backwards")
 
     filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
     backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
@@ -145,6 +151,9 @@ class TimeSkew(Effect):
     declares = Property.RATE_OF_TORQUE
     abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s"),)
+    reported = Reported.DELAY
+    form_settings = ("backwards",)
+    added_settings = ("filter_s", "backwards")
 
     filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
     backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Reported, Sense, Switch, sense_fault
 from ident.effects.rotor import least_rotor_rest, loss_columns
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal, watched_s
 from ident.model.model import Column
@@ -70,6 +70,11 @@ class NonlinearViscous(SpeedFriction):
         """Linear parameter, with a unit that depends on the exponent."""
         return (Column("coefficient", f"Nm/(rad/s)^{self.exponent:.3g}", least=0.0),)
 
+    @property
+    def nearly_declared(self) -> Mapping[str, Range]:
+        """With an exponent near one it is viscous friction."""
+        return {"exponent": Range(0.8, 1.25)}
+
     def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
         """Torque per unit of the coefficient, shape (1, k)."""
         v = velocity_rad_s
@@ -107,6 +112,9 @@ class LoadFriction(Effect):
     name = "load-friction"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.LOAD
+    has_rotor_form = True
+    form_settings = ("rotor_inertia_kg_m2", "with_rotor")
+    added_settings = ("rotor_inertia_kg_m2", "with_rotor")
 
     speed_exponent: Switch  #: η, 0 for dry and 1 for viscous friction
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
@@ -123,6 +131,11 @@ class LoadFriction(Effect):
             loss = Column("coefficient", "Nm/Nm", least=0.0)
             rest = Column("rotor rest", "kg m²", least=least)
         return (loss, rest)[: 1 + self.with_rotor]
+
+    @property
+    def reported(self) -> Reported:
+        """A share of the load of dry friction; of viscous friction its coefficient."""
+        return Reported.COEFFICIENTS if self.speed_exponent else Reported.SHARE_OF_LOAD
 
     @property
     def forms(self) -> tuple[LoadFriction, ...]:
@@ -150,6 +163,7 @@ class PositionFriction(Effect):
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.POSITION
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
+    reported = Reported.AMPLITUDE
     needs_revolute = True
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
@@ -284,6 +298,11 @@ class Coupling(Effect):
 
     other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
     sense: Sense  #: 1 for the sum of the speeds, −1 for their difference
+
+    @property
+    def settings_fault(self) -> str:
+        """A sense of 0 is none."""
+        return sense_fault(self.sense)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 2, k)."""

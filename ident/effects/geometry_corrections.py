@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.data.dataset import Dataset
-from ident.effects.effect import Effect, GearSide, PlacedEffect, Property
+from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, Reported
 from ident.effects.signals import Abscissa, Arm, Signals
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, with_geometry
 from ident.model.model import Column, Model
@@ -70,6 +70,7 @@ class ZeroOffset(GeometryEffect):
     """
 
     name = "zero-offset"
+    reported = Reported.ANGLES
     needs_tree = True
     declares = Property.TURNS_THE_ARM
     abscissa = Abscissa.LOAD
@@ -115,6 +116,7 @@ class GravityDirection(GeometryEffect):
     """
 
     name = "gravity-direction"
+    reported = Reported.ANGLES
     declares = Property.TURNS_THE_ARM
     abscissa = Abscissa.LOAD
     has_axis = False
@@ -171,6 +173,7 @@ class LatePosition(GeometryEffect):
     """
 
     name = "late-position"
+    reported = Reported.DELAY
     needs_tree = True
     declares = Property.TURNS_THE_ARM
     abscissa = Abscissa.TORQUE_RATE

@@ -19,10 +19,11 @@ from importlib.metadata import EntryPoint, entry_points, packages_distributions,
 from itertools import chain
 
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
-from ident.effects.effect import Effect, GearSide, is_shipped, setting_kind, setting_range
+from ident.effects.effect import Effect, GearSide, Reported, is_shipped, setting_kind, setting_range
 from ident.errors import EffectRefused
 
 ENTRY_POINT_GROUP = "drivegain.effects"
+ROTOR_SETTINGS = ("rotor_inertia_kg_m2", "with_rotor")  #: Of an effect with a rotor's form
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 Family = tuple[Effect, ...]
@@ -182,11 +183,12 @@ def _check(effect: Effect, where: str) -> None:
             f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; expected each as "
             "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
         )
-    if effect.side is GearSide.TWO_JOINTS and "other_axis" not in kept:
+    if effect.side is GearSide.TWO_JOINTS and effect.axis_setting not in kept:
         raise EffectRefused(
-            f"{where}: found effect {name!r} on two joints without a setting `other_axis`; expected the number of the "
-            "second one: `other_axis: Annotated[int, ident.Range(0, 12)] = 0`"
+            f"{where}: found effect {name!r} on two joints without a setting `{effect.axis_setting}`; expected the "
+            f"number of the second one: `{effect.axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
         )
+    _check_properties(effect, where)
     for setting, value in effect.settings.items():
         kind = setting_kind(effect, setting)
         if type(value) is not kind:
@@ -200,12 +202,6 @@ def _check(effect: Effect, where: str) -> None:
                 f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from {allowed.least:g} to "
                 f"{allowed.largest:g}, as its range says; correct one of both"
             )
-    unknown = sorted(set(effect.refined_once_chosen) - kept)
-    if unknown:
-        raise EffectRefused(
-            f"{where}: found {', '.join(unknown)} in `refined` of effect {name!r}; expected names among its settings: "
-            f"{', '.join(sorted(kept)) or 'it has none'}"
-        )
     coefficients = [column.name for column in effect.coefficients]
     if len(set(coefficients)) < len(coefficients):
         raise EffectRefused(f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for each")
@@ -214,4 +210,30 @@ def _check(effect: Effect, where: str) -> None:
         raise EffectRefused(
             f"{where}: found coefficients {[column.name for column in effect.coefficients]} of effect {name!r}; "
             "expected at least one, with a name without a colon"
+        )
+
+
+def _check_properties(effect: Effect, where: str) -> None:
+    """Refuse an effect whose properties name settings that it does not have."""
+    named = {
+        "refined": effect.refined_once_chosen,
+        "axis_setting": (effect.axis_setting,) if effect.axis_setting else (),
+        "form_settings": effect.form_settings,
+        "key_settings": effect.key_settings,
+        "added_settings": effect.added_settings,
+        "nearly_declared": tuple(effect.nearly_declared),
+        "has_rotor_form": ROTOR_SETTINGS if effect.has_rotor_form else (),
+    }
+    settings = sorted(effect.settings)
+    for given, names in named.items():
+        unknown = sorted(set(names) - set(settings))
+        if unknown:
+            raise EffectRefused(
+                f"{where}: found {', '.join(unknown)} in `{given}` of effect {effect.name!r}; expected names among its "
+                f"settings: {', '.join(settings) or 'it has none'}"
+            )
+    if effect.reported is Reported.AMPLITUDE and len(effect.coefficients) != 2:
+        raise EffectRefused(
+            f"{where}: found {len(effect.coefficients)} coefficients of effect {effect.name!r}, which reports give as "
+            "one amplitude; expected two, of a cosine and a sine; leave `reported` out"
         )

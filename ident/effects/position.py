@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Sense, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Reported, Sense, Switch, sense_fault
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
@@ -70,6 +70,7 @@ class Compensator(Effect):
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
+    reported = Reported.AMPLITUDE
     needs_revolute = True
 
     order: Annotated[int, Range(1, 1000)]  #: k, in the joint's revolutions
@@ -134,6 +135,11 @@ class Hinge(Effect):
 
     start_rad: Annotated[float, Range(-1e3, 1e3)]  #: q₀
     sense: Sense  #: σ, 1 where it pulls above q₀, −1 below
+
+    @property
+    def settings_fault(self) -> str:
+        """A sense of 0 is none."""
+        return sense_fault(self.sense)
 
     @property
     def coefficients(self) -> tuple[Column, ...]:

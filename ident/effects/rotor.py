@@ -86,7 +86,7 @@ def known_rotors(effects: Iterable[PlacedEffect], axes: int) -> tuple[float, ...
     """
     known: dict[int, float] = {}
     for placed in effects:
-        inertia_kg_m2 = placed.effect.settings.get("rotor_inertia_kg_m2", 0.0)
+        inertia_kg_m2 = placed.effect.known_rotor_kg_m2
         if inertia_kg_m2:
             known.setdefault(placed.axis, inertia_kg_m2)
     if not known:

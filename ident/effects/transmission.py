@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Switch
+from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Reported, Switch
 from ident.effects.rotor import beside_rotor, least_rotor_rest, loss_columns
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.effects.twist import Gears, link_of, spring_torque, torque_of_twist, twists
@@ -36,6 +36,9 @@ class Backlash(Effect):
     declares = Property.ODD_IN_LOAD
     abscissa = Abscissa.LOAD
     coefficients = (Column("half gap", "rad", least=0.0),)
+    form_settings = ("held", "sags", "rotor_inertia_kg_m2")
+    added_settings = ("half_gap_rad", "resonant_rad_nm", "damping_ratio", *form_settings)
+    refined = ()  # by `ident.discovery.resonance`
 
     #: W, over which the side changes, in parts of the load's root mean square; 0 where the crossing is computed.
     share: Annotated[float, Range(0.0, 1.0)]
@@ -45,6 +48,11 @@ class Backlash(Effect):
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
     sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+
+    @property
+    def known_rotor_kg_m2(self) -> float:
+        """J, which it takes off the load."""
+        return self.rotor_inertia_kg_m2
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
@@ -81,12 +89,20 @@ class Elasticity(Effect):
     declares = Property.RATE_OF_LOAD
     abscissa = Abscissa.LOAD_CURVATURE
     coefficients = (Column("compliance", "rad/Nm", least=0.0),)
+    form_settings = ("held", "sags", "rotor_inertia_kg_m2")
+    added_settings = ("resonant_rad_nm", "damping_ratio", *form_settings)
+    refined = ()  # by `ident.discovery.resonance`
 
     resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0  #: c₀, the compliance that sets the resonance
     damping_ratio: Annotated[float, Range(0.0, 10.0)] = 0.0  #: ζ
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
     sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+
+    @property
+    def known_rotor_kg_m2(self) -> float:
+        """J, which it takes off the load."""
+        return self.rotor_inertia_kg_m2
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
@@ -139,6 +155,11 @@ class Efficiency(Effect):
     name = "efficiency"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.LOAD
+    reported = Reported.SHARE_OF_LOAD
+    has_rotor_form = True
+    form_settings = ("rotor_inertia_kg_m2", "with_rotor")
+    added_settings = ("rotor_inertia_kg_m2", "with_rotor")
+    refined = ()
 
     friction_share: Annotated[float, Range(1e-3, 1.0)]  #: σ, of the joint's friction that lies behind the gear
     rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
@@ -203,6 +224,8 @@ class Ripple(Effect):
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
+    reported = Reported.AMPLITUDE
+    key_settings = ("order", "of_joint")
 
     order: Annotated[float, Range(1e-4, 1e4)]  #: k, periods a revolution of θ
     of_joint: Switch = 0  #: 1 where θ is the joint's angle, which differs where a motor turns with several joints

@@ -36,6 +36,7 @@ class Smooth(Effect):
     """
 
     declares = Property.SMOOTH
+    refined = ()  # its range is that of the data
 
     variable: Abscissa  #: x
     #: Its range; outside of it the function keeps its value at the end.
@@ -48,6 +49,20 @@ class Smooth(Effect):
     def side(self) -> GearSide:
         """Motor where the variable is the motor's, else joint."""
         return GearSide.MOTOR if self.variable in MOTOR_VARIABLES else GearSide.JOINT
+
+    @property
+    def axis_setting(self) -> str:
+        """The other axis, where x is its velocity."""
+        return "other_axis" if self.variable is Abscissa.OTHER_VELOCITY else ""
+
+    @property
+    def settings_fault(self) -> str:
+        """Another axis where x is not its velocity, or an empty range."""
+        if self.other_axis and not self.axis_setting:
+            return f"other_axis = {self.other_axis:g}; it has no other axis: 0"
+        if not self.lower < self.upper:
+            return f"the range {self.lower:g} to {self.upper:g}; it must not be empty"
+        return ""
 
     @property
     def name(self) -> str:

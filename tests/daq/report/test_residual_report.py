@@ -68,7 +68,7 @@ from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.discovery.search import Finding
 from ident.discovery.time_skew import CurrentDelay
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import PlacedEffect, Reported
 from ident.effects.electrical import Saturation
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
@@ -77,6 +77,7 @@ from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
+from ident.model.model import Column
 from ident.planning.gain_verdict import Advice, GainSource, GainVerdict, Visibility
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
@@ -898,6 +899,27 @@ def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
     assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°, to be added to its position"
     moved = Parameter("zero-offset offset 1", 0.003, 0.0001, "m")
     assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m, to be added to its position"
+
+
+@dataclass(frozen=True, slots=True)
+class OfOthers(Spring):
+    """An effect of one's own, whose coefficients have names and units of the dictionary's."""
+
+    name = "of-others"
+    coefficients = (Column("cosine", "s"), Column("sine", "Nm/Nm"))  # type: ignore[assignment]
+
+
+class OneAmplitude(OfOthers):
+    """The same, which declares that they are of one angle."""
+
+    __slots__ = ()
+    reported = Reported.AMPLITUDE
+
+
+def test_coefficients_are_given_as_their_class_says_and_not_by_name_or_unit() -> None:
+    found = (Parameter("c", 3.0, 0.1, "s"), Parameter("d", 4.0, 0.1, "Nm/Nm"))
+    assert named_size(OfOthers(), found) == "cosine 3.00 ± 0.10 s, sine 4.00 ± 0.10 Nm/Nm"
+    assert named_size(OneAmplitude(), found) == "amplitude 5.00 ± 0.10 s"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:

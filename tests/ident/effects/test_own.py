@@ -13,9 +13,11 @@ import pytest
 
 import ident
 from ident.arrays import FloatArray
+from ident.discovery.search import effect_key
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import columns_at, fits_data
+from ident.effects.effect import PlacedEffect, check_settings, columns_at, fits_data
 from ident.effects.own import SHIPPED, families_of, installed_families, known_effect, package_of, search_families
+from ident.effects.rotor import known_rotors
 from ident.effects.signals import Signals
 
 SAMPLES = 5
@@ -56,6 +58,22 @@ class Spring(SquareDrag):
 @dataclass(frozen=True, slots=True)
 class SecondDrag(SquareDrag):
     """Another class with the same name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rotor(SquareDrag):
+    """A rotor's form without its settings."""
+
+    name = "rotor-drag"
+    has_rotor_form = True
+
+
+@dataclass(frozen=True, slots=True)
+class OneWave(SquareDrag):
+    """An amplitude of one coefficient."""
+
+    name = "wave-drag"
+    reported = ident.Reported.AMPLITUDE
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +128,8 @@ class Misspelled(SquareDrag):
         ([SHIPPED["spring"]], r"drivegain's own effect 'spring'; expected others: it is tried without this"),
         ([Twice()], r"coefficients \['drag', 'drag'\] of effect 'twice-drag'; expected a name for each"),
         ([Misspelled()], r"exponents in `refined` of effect 'misspelled-drag'; expected names among its .*: exponent"),
+        ([Rotor()], r"rotor_inertia_kg_m2, with_rotor in `has_rotor_form` of effect 'rotor-drag'; expected names"),
+        ([OneWave()], r"1 coefficients of effect 'wave-drag', which reports give as one amplitude; expected two"),
         ([SquareDrag], r"the class SquareDrag; expected objects of subclasses of `ident.Effect`"),
         (["spring"], r"'spring'; expected objects"),
         ([Named()], r"the name 'Square Drag'; expected lowercase words joined by hyphens"),
@@ -303,3 +323,95 @@ def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
     effect = SquareDrag(2.0)
     assert effect.settings == {"exponent": 2.0}
     assert effect.with_settings({"exponent": 0.7}) == replace(effect, exponent=0.7)
+
+
+NAMES_OF_THE_DICTIONARY = (
+    *("lower", "upper", "sense", "other_axis", "order", "exponent", "with_rotor", "rotor_inertia_kg_m2"),
+    *("held", "sags", "two_terms", "backwards", "half_gap_rad", "resonant_rad_nm", "damping_ratio", "filter_s"),
+)
+"""Names that settings of the dictionary have, where they mean something."""
+
+
+@dataclass(frozen=True, slots=True)
+class Borrowed(SquareDrag):
+    """One whose settings have names of the dictionary's, and which declares nothing."""
+
+    name = "borrowed-names"
+    coefficients = (ident.Column("cosine", "Nm"), ident.Column("sine", "Nm"))  # type: ignore[assignment]
+
+    lower: Annotated[float, ident.Range(0.0, 9.0)] = 3.0
+    upper: Annotated[float, ident.Range(0.0, 9.0)] = 1.0
+    sense: Annotated[int, ident.Range(-1, 1)] = 0
+    other_axis: Annotated[int, ident.Range(0, 9)] = 9
+    order: Annotated[float, ident.Range(0.0, 9.0)] = 2.5
+    with_rotor: Annotated[int, ident.Range(0, 1)] = 1
+    rotor_inertia_kg_m2: Annotated[float, ident.Range(0.0, 9.0)] = 0.4
+    held: Annotated[int, ident.Range(0, 1)] = 0
+    sags: Annotated[int, ident.Range(0, 1)] = 0
+    two_terms: Annotated[int, ident.Range(0, 1)] = 1
+    backwards: Annotated[int, ident.Range(0, 1)] = 1
+    half_gap_rad: Annotated[float, ident.Range(0.0, 9.0)] = 0.0
+    resonant_rad_nm: Annotated[float, ident.Range(0.0, 9.0)] = 0.0
+    damping_ratio: Annotated[float, ident.Range(0.0, 9.0)] = 0.0
+    filter_s: Annotated[float, ident.Range(0.0, 9.0)] = 0.0
+
+
+BORROWED = Borrowed()
+
+
+def test_settings_with_names_of_the_dictionary_mean_nothing() -> None:
+    assert set(NAMES_OF_THE_DICTIONARY) == set(BORROWED.settings)
+    families_of([BORROWED], "here")
+    check_settings(BORROWED, BORROWED.settings, 0, AXES)
+    assert BORROWED.second_axis is None
+    assert not BORROWED.has_rotor_form
+    assert not BORROWED.fits_rotor
+    assert BORROWED.form_settings == BORROWED.added_settings == ()
+    assert BORROWED.nearly_declared == {}
+    placed = PlacedEffect(BORROWED, 0)
+    assert placed.name_among(("J1", "J2")) == "borrowed-names on J1"
+    assert known_rotors([placed], AXES) == ()
+    (column, _) = placed.columns
+    missing = [name for name in NAMES_OF_THE_DICTIONARY if f"{name} " not in column.name]
+    assert missing == []  # a value of zero is one like any other
+
+
+def test_two_effects_of_one_axis_differ_in_whole_numbers_alone() -> None:
+    assert effect_key(BORROWED, 0) == effect_key(replace(BORROWED, order=3.0, lower=4.0), 0)
+    for name in ("sense", "with_rotor", "held", "two_terms", "backwards"):
+        other = BORROWED.with_settings({name: 1 - int(BORROWED.settings[name])})
+        assert effect_key(BORROWED, 0) != effect_key(other, 0), name
+
+
+@dataclass(frozen=True, slots=True)
+class Declaring(SquareDrag):
+    """One that declares what its settings mean."""
+
+    name = "declaring-drag"
+    axis_setting = "driver"
+    form_settings = ("form",)
+    added_settings = ("form",)
+    key_settings = ("exponent",)
+
+    driver: Annotated[int, ident.Range(1, 9)] = 2
+    form: Annotated[int, ident.Range(0, 1)] = 0
+
+    @property
+    def settings_fault(self) -> str:
+        """An exponent of one in the second form."""
+        return "exponent = 1 in its second form; expected another" if self.form and self.exponent == 1.0 else ""
+
+
+def test_a_meaning_that_a_class_declares_is_used() -> None:
+    effect = Declaring()
+    families_of([effect], "here")
+    assert effect.second_axis == 2
+    assert PlacedEffect(effect, 0).name_among(("J1", "J2")) == "declaring-drag on J1 with J2"
+    (column,) = PlacedEffect(effect, 0).columns
+    assert "form" not in column.name
+    assert effect_key(effect, 0) == effect_key(effect.with_settings({"form": 1}), 0)
+    assert effect_key(effect, 0) != effect_key(effect.with_settings({"exponent": 2.0}), 0)
+    with pytest.raises(ident.EffectRefused, match=r"on axis 2 is given driver = 2; it is the number of another of"):
+        check_settings(effect, effect.settings, 1, AXES)
+    with pytest.raises(ident.EffectRefused, match=r"'declaring-drag' is given exponent = 1 in its second form"):
+        check_settings(effect, {**effect.settings, "form": 1}, 0, AXES)
