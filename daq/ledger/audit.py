@@ -11,6 +11,7 @@ is missing. docs/decisions/0036 says what this defends against.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
@@ -189,13 +190,26 @@ def append(
             line += encode(last) + b"\n"
         new = entry_after(last, at.isoformat(), who, action, subject, details)
         line += encode(new) + b"\n"
-        if os.write(descriptor, line) != len(line):
-            raise OSError(28, "No space left on device", str(path))
+        _write_all(descriptor, line)
         os.fsync(descriptor)
         if not content:
             fsync_folder(Path(os.path.realpath(path)).parent)
         _note_head(path, content, new.sha256)
         return new
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    """Write all bytes, in several calls where the system takes a part: the next call says why it took no more.
+
+    Raises:
+        OSError: from the file system; what was written until then stays.
+    """
+    rest = memoryview(data)
+    while rest:
+        taken = os.write(descriptor, rest)
+        if taken == 0:
+            raise OSError(errno.EIO, "the file system takes no more of an entry")
+        rest = rest[taken:]
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:

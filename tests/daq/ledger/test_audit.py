@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -343,22 +344,6 @@ def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
     assert flushed == [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
 
 
-def test_a_full_disk_is_reported_and_leaves_a_line_that_the_next_entry_reports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a"
-    _filled(path, 1)
-    write = os.write
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:40]))
-        with pytest.raises(OSError, match="No space"):
-            _filled(path, 1)
-    _filled(path, 1)
-    verdict = verify(path)
-    assert verdict.holds
-    assert verdict.torn == (2,)
-
-
 def _append_many(path: Path, who: str) -> None:
     for k in range(25):
         append(path, AuditAction.PROPOSED, at=NOW, who=who, subject="x", details={"k": k})
@@ -406,3 +391,44 @@ def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object
     verdict = verify(path)
     assert verdict.holds
     assert len(verdict.open_writes) == 2
+
+
+def test_an_entry_that_the_system_takes_in_parts_is_written_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda descriptor, data: write(descriptor, bytes(data)[:7]))
+    made = append(path, AuditAction.PROPOSED, at=NOW, who="me", subject="cell", details={"n": 1})
+    monkeypatch.undo()
+    assert read(path) == (made,)
+    assert verify(path).holds
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EDQUOT, errno.ENOSPC])
+def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    first = append(path, AuditAction.PROPOSED, at=NOW, who="me", subject="cell", details={"n": 1})
+    write = os.write
+    calls: list[int] = []
+
+    def short(descriptor: int, data: bytes) -> int:
+        calls.append(descriptor)
+        if len(calls) > 1:
+            raise OSError(number, os.strerror(number))
+        return write(descriptor, bytes(data)[:20])
+
+    monkeypatch.setattr(os, "write", short)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        append(path, AuditAction.WRITE_FOUND, at=NOW, who="me", subject="cell", details={"n": 2})
+    monkeypatch.undo()
+    assert caught.value.errno == number
+    # The unfinished line is reported by the next entry, and the chain holds.
+    append(path, AuditAction.WRITE_FOUND, at=NOW, who="me", subject="cell", details={"n": 2})
+    entries = read(path)
+    assert entries[0] == first
+    assert [one.action for one in entries[1:]] == [AuditAction.TORN_LINE, AuditAction.WRITE_FOUND]
+    assert verify(path).holds
+    assert verify(path).torn == (2,)
