@@ -1,4 +1,6 @@
-"""`drivegain history`: every calibration of a cell, how its gains have changed, and whether they drift."""
+"""`drivegain history`: every calibration of a cell, how its gains have changed,
+and whether they drift.
+"""
 
 from __future__ import annotations
 
@@ -38,41 +40,71 @@ _LOG = logging.getLogger("drivegain")
 
 _SHOWN = 5  #: Sentences of a kind in an error; --json has all
 
-_PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}  #: Suffixes of pictures, and text at the beginning of such a file
+#: Suffixes of pictures, and text at the beginning of such a file
+_PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}
 
 
 def history_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file; it says where its history is.")],
-    axis: Annotated[str | None, typer.Option("--axis", help="One axis: every calibration of its gain.")] = None,
+    axis: Annotated[
+        str | None, typer.Option("--axis", help="One axis: every calibration of its gain.")
+    ] = None,
     plot: Annotated[Path | None, output_option("--plot", "Picture to write, .png or .svg.")] = None,
-    csv: Annotated[Path | None, output_option("--csv", "Table to write, for a spreadsheet.")] = None,
+    csv: Annotated[
+        Path | None, output_option("--csv", "Table to write, for a spreadsheet.")
+    ] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
         str | None,
-        typer.Option("--acknowledge", metavar="AXIS", help="The change of an axis is explained: begin a new baseline."),
+        typer.Option(
+            "--acknowledge",
+            metavar="AXIS",
+            help="The change of an axis is explained: begin a new baseline.",
+        ),
     ] = None,
-    by: Annotated[str | None, typer.Option("--by", help="With --acknowledge: who explains it; you by default.")] = None,
-    why: Annotated[str | None, typer.Option("--why", help="With --acknowledge: what happened.")] = None,
+    by: Annotated[
+        str | None,
+        typer.Option("--by", help="With --acknowledge: who explains it; you by default."),
+    ] = None,
+    why: Annotated[
+        str | None, typer.Option("--why", help="With --acknowledge: what happened.")
+    ] = None,
     since: Annotated[
-        str | None, typer.Option("--since", metavar="DATE", help="With --acknowledge: first day of the baseline.")
+        str | None,
+        typer.Option(
+            "--since", metavar="DATE", help="With --acknowledge: first day of the baseline."
+        ),
     ] = None,
-    verify: Annotated[bool, typer.Option("--verify", help="Check audit and history; exit code 4 if broken.")] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check audit and history; exit code 4 if broken.")
+    ] = False,
     migrate: Annotated[
         bool,
-        typer.Option("--migrate", "--rebuild", help="Take the SQLite file of earlier versions into the audit."),
+        typer.Option(
+            "--migrate",
+            "--rebuild",
+            help="Take the SQLite file of earlier versions into the audit.",
+        ),
     ] = False,
     rename: Annotated[
         str | None,
-        typer.Option("--rename", metavar="OLD", help="The cell was called OLD: take its history and sessions over."),
+        typer.Option(
+            "--rename",
+            metavar="OLD",
+            help="The cell was called OLD: take its history and sessions over.",
+        ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="With --rename: do it; without it, it is only shown.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="With --rename: do it; without it, it is only shown.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
+    """Show the calibrations of a cell, which were applied, the change of each gain with its σ,
+    and alarms.
 
-    An alarm means that a gain has changed by more than noise: a drift that adds up (CUSUM), a steady trend, or one
-    calibration far off. Possible causes are printed as questions. docs/evidence/drift.md says how often an alarm is
-    false.
+    An alarm means that a gain has changed by more than noise: a drift that adds up (CUSUM), a
+    steady trend, or one calibration far off. Possible causes are printed as questions.
+    docs/evidence/drift.md says how often an alarm is false.
     """
     from daq.ledger.ledger import MAY_LACK, Ledger
     from daq.report.history import (
@@ -89,10 +121,15 @@ def history_verb(
     ledger = Ledger.of(declared)
     if ledger is None:
         raise ConfigurationInconsistent(
-            str(cell), found="no history", expected="a cell file", remedy="give the cell file, not a log"
+            str(cell),
+            found="no history",
+            expected="a cell file",
+            remedy="give the cell file, not a log",
         )
     _check_files(plot, csv)
-    _check_companions("--acknowledge AXIS", acknowledge, {"--by": by, "--why": why, "--since": since})
+    _check_companions(
+        "--acknowledge AXIS", acknowledge, {"--by": by, "--why": why, "--since": since}
+    )
     _check_companions("--rename OLD", rename, {"--yes": yes or None})
     now = datetime.now(UTC)
     who = str(applier(by if acknowledge is not None else None))
@@ -113,7 +150,8 @@ def history_verb(
     current = in_force(declared, history)
     actions = describe_actions(history.entries, history.events, current)
     if verify and declared.controller_path is not None:
-        # Where its links lead decides which writes are this cell's: another user's link could hide some.
+        # Where its links lead decides which writes are this cell's: another user's link could hide
+        # some.
         resolve_links(declared.controller_path)
     console = output_console()
     if json:
@@ -132,7 +170,9 @@ def history_verb(
         _require_log(ledger, checked)
 
 
-def _check_companions(option: str, given: str | None, companions: Mapping[str, object | None]) -> None:
+def _check_companions(
+    option: str, given: str | None, companions: Mapping[str, object | None]
+) -> None:
     """Refuse options that mean something beside another one only."""
     lonely = [name for name, value in companions.items() if value is not None]
     if given is None and lonely:
@@ -145,7 +185,9 @@ def _check_companions(option: str, given: str | None, companions: Mapping[str, o
 
 
 def _require_log(ledger: Ledger, checked: Verification) -> None:
-    """Refuse to call a history whole whose audit log is absent, where backups show that there were writes."""
+    """Refuse to call a history whole whose audit log is absent,
+    where backups show that there were writes.
+    """
     from daq.writeback.file_access import backups_without_log, resolve_links
 
     controller = ledger.cell.controller_path
@@ -155,9 +197,11 @@ def _require_log(ledger: Ledger, checked: Verification) -> None:
     if count > 0:
         raise DataError(
             str(ledger.audit),
-            found=f"no file, although {controller} has {counted(count, 'backup')} of earlier writes beside it",
+            found=f"no file, although {controller} has {counted(count, 'backup')} of earlier "
+            "writes beside it",
             expected="the audit log with these writes",
-            remedy="restore it with its `.head`, and ask who removed it; if it is kept elsewhere on purpose, go on: "
+            remedy="restore it with its `.head`, and ask who removed it; if it is kept elsewhere "
+            "on purpose, go on: "
             "the next write begins a new log, and says so in it",
         )
 
@@ -173,14 +217,18 @@ def _read(ledger: Ledger, verify: bool) -> tuple[Verification | None, History, t
 
 
 def _verified(ledger: Ledger) -> Verification:
-    """Check audit and history; an audit that is no regular file is as broken as one that was edited."""
+    """Check audit and history; an audit that is no regular file is as broken as one that was
+    edited.
+    """
     from daq.ledger.ledger import verify_ledger
 
     try:
         return verify_ledger(ledger, _session_heads(ledger.cell))
     except AuditUnusable as error:
         remedy = "correct `history.audit` of the cell file"
-        raise DataError(error.subject, found=error.found, expected=error.expected, remedy=remedy) from error
+        raise DataError(
+            error.subject, found=error.found, expected=error.expected, remedy=remedy
+        ) from error
 
 
 def _session_heads(cell: Cell) -> list[str]:
@@ -188,7 +236,9 @@ def _session_heads(cell: Cell) -> list[str]:
     from daq.jobs.session import sessions
 
     past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
-    return [session.state.audit_sha256 for session in past if session.state.audit_sha256 is not None]
+    return [
+        session.state.audit_sha256 for session in past if session.state.audit_sha256 is not None
+    ]
 
 
 def _require(ledger: Ledger, checked: Verification) -> None:
@@ -205,16 +255,20 @@ def _require(ledger: Ledger, checked: Verification) -> None:
             str(checked.audit),
             found=_first([*checked.broken, *unknown]),
             expected="calibrations that this version can read",
-            remedy="use the version of drivegain that entered them, or keep this file and begin another one under a "
+            remedy="use the version of drivegain that entered them, or keep this file and begin "
+            "another one under a "
             "new name (`history.audit`)",
         )
     if checked.unknown:
         raise HistoryUnreadable(
             str(checked.audit),
             found=_first(unknown),
-            expected="a calibration in the history, and an end, of every write to this cell's controller",
-            remedy="`drivegain history CELL --add CALIBRATION` for each calibration that was written, which also "
-            "enters its writes from the audit; of a rollback with any one. Where a calibration is lost, keep the file "
+            expected="a calibration in the history, and an end, of every write to this cell's "
+            "controller",
+            remedy="`drivegain history CELL --add CALIBRATION` for each calibration that was "
+            "written, which also "
+            "enters its writes from the audit; of a rollback with any one. Where a calibration is "
+            "lost, keep the file "
             "and begin another one under a new name (`history.audit`)",
         )
 
@@ -231,14 +285,18 @@ def _check_files(plot: Path | None, csv: Path | None) -> None:
     if plot is not None:
         mark = _PICTURES.get(plot.suffix.lower())
         if mark is None:
-            raise UsageError("--plot", found=plot.name, expected="a name in .png or .svg", remedy="give one")
+            raise UsageError(
+                "--plot", found=plot.name, expected="a name in .png or .svg", remedy="give one"
+            )
         check_replaceable(plot, mark, "picture")
     if csv is not None:
         check_replaceable(csv, ",".join(COLUMNS[:3]), "table of a history")
 
 
 def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
-    """Migrate a history of an earlier version; where that fails unasked, reading it reports what is wrong."""
+    """Migrate a history of an earlier version;
+    where that fails unasked, reading it reports what is wrong.
+    """
     from daq.ledger.ledger import migrate
 
     if not forced and not ledger.outdated:
@@ -253,9 +311,16 @@ def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
     if done.aside is None:
         say(f"There is no history of an earlier version; {ledger.audit} is the history.", err=True)
         return
-    say(f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.", err=True)
+    say(
+        f"Migrated to {ledger.audit}: {done.entries} entries. The old history is {done.aside}.",
+        err=True,
+    )
     if done.flaws:
-        say(f"The old history was broken ({_first(done.flaws)}): what only it had was not taken over.", err=True)
+        say(
+            f"The old history was broken ({_first(done.flaws)}): what only it had was not "
+            "taken over.",
+            err=True,
+        )
 
 
 def _say_names(history: History, cell_file: Path) -> None:
@@ -267,7 +332,8 @@ def _say_names(history: History, cell_file: Path) -> None:
         _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
     if history.renamed is not None:
         _LOG.warning(
-            "this cell was renamed: found the name %r, expected %r, since %s; give the cell file with that name",
+            "this cell was renamed: found the name %r, expected %r, since %s; give the cell file "
+            "with that name",
             history.renamed.old,
             history.renamed.new,
             history.renamed.at,
@@ -275,15 +341,20 @@ def _say_names(history: History, cell_file: Path) -> None:
     for name in history.possible_names:
         command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"
         _LOG.warning(
-            "this cell has no calibration here, and cell %r, of a robot with the same joints and drives, has; if this "
+            "this cell has no calibration here, and cell %r, of a robot with the same joints and "
+            "drives, has; if this "
             "is that robot under a new name: `%s`",
             printable(name),
             command,
         )
 
 
-def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, *, confirmed: bool) -> None:
-    """Take the history and the sessions of a cell's earlier name over; without `confirmed`, say what that would be."""
+def _rename(
+    ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, *, confirmed: bool
+) -> None:
+    """Take the history and the sessions of a cell's earlier name over;
+    without `confirmed`, say what that would be.
+    """
     from daq.jobs.position import sessions_folder
     from daq.jobs.session import rename_sessions, sessions_to_rename
     from daq.jobs.units import unit_name
@@ -296,7 +367,8 @@ def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, 
             "--rename",
             found=f"{old!r}, the name in {cell_file}",
             expected="the name that the cell had before",
-            remedy="write the new name into the cell file (`name:`) first, then give the old one here",
+            remedy="write the new name into the cell file (`name:`) first, then give the "
+            "old one here",
         )
     folders = {sessions_folder(cell_file)}
     if cell.recalibration is not None:
@@ -315,12 +387,17 @@ def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, 
         )
         if planned.undescribed:
             say(
-                f"{counted(planned.undescribed, 'calibration')} of earlier versions do not say of which robot: the "
+                f"{counted(planned.undescribed, 'calibration')} of earlier versions do not say of "
+                "which robot: the "
                 "names of the axes are the same, and nothing else could be compared.",
                 err=True,
             )
         if not confirmed:
-            say(f"Would rename {old!r} to {cell.name!r}: {taken}. Nothing was changed; --yes does it.", err=True)
+            say(
+                f"Would rename {old!r} to {cell.name!r}: {taken}. Nothing was changed; "
+                "--yes does it.",
+                err=True,
+            )
             return
         rename_cell(ledger, planned, who=who, at=now)
         rename_sessions(folders, old, cell.name, until)
@@ -328,24 +405,32 @@ def _rename(ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, 
         say(f"Renamed {old!r} to {cell.name!r}: {taken}.", err=True)
     else:
         say(
-            f"{old!r} was renamed to {cell.name!r} on {planned.entered_at:%Y-%m-%d}; {counted(count, 'session')} taken "
+            f"{old!r} was renamed to {cell.name!r} on {planned.entered_at:%Y-%m-%d}; "
+            f"{counted(count, 'session')} taken "
             "over now.",
             err=True,
         )
     say(
-        "Logs, plans and calibration files keep the old name: make new ones. A schedule of the old name "
-        f"({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: drivegain schedule.",
+        "Logs, plans and calibration files keep the old name: make new ones. A schedule of the "
+        "old name "
+        f"({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: "
+        "drivegain schedule.",
         err=True,
     )
 
 
-def _acknowledge(ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime) -> None:
+def _acknowledge(
+    ledger: Ledger, series: Series, who: str, why: str | None, since: str | None, now: datetime
+) -> None:
     from daq.ledger.ledger import acknowledge
 
     if not why or not why.strip():
         reason = "what happened, for a reader in a year"
-        raise UsageError("--why", found="nothing", expected=reason, remedy='give it: --why "gearbox changed"')
-    # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
+        raise UsageError(
+            "--why", found="nothing", expected=reason, remedy='give it: --why "gearbox changed"'
+        )
+    # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may
+    # be ahead of ours.
     begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
     acknowledge(ledger, series.axis, since=begins, at=now, who=who, why=why)
 
@@ -373,7 +458,10 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
         if write.ended.number not in left:
             say(f"Entered too: {printable(str(write))}.", err=True)
     if not checked.complete:
-        say("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.", err=True)
+        say(
+            "Not all writes in the audit could be entered: see `drivegain history CELL --verify`.",
+            err=True,
+        )
 
 
 def _day(text: str, now: datetime) -> datetime:
@@ -383,7 +471,10 @@ def _day(text: str, now: datetime) -> datetime:
     found = utc(text, never)
     if found == never:
         raise UsageError(
-            "--since", found=repr(text), expected="a date, 2026-03-02, or a time with its zone", remedy="spell it so"
+            "--since",
+            found=repr(text),
+            expected="a date, 2026-03-02, or a time with its zone",
+            remedy="spell it so",
         )
     if found > now:
         # Until then every calibration would be left out, and no alarm of the axis shown.
@@ -391,7 +482,8 @@ def _day(text: str, now: datetime) -> datetime:
             "--since",
             found=f"{text!r}, which is {found:%Y-%m-%d %H:%M:%S} UTC",
             expected=f"no later than now, {now:%Y-%m-%d %H:%M:%S} UTC",
-            remedy="give the day of the change, with its zone where the day here is not that of UTC "
+            remedy="give the day of the change, with its zone where the day here is not "
+            "that of UTC "
             "(2026-03-02T00:00+10:00); acknowledge the alarm of a coming change when it is shown",
         )
     return found
@@ -401,7 +493,10 @@ def _named(all_series: tuple[Series, ...], axis: str, cell: Cell) -> Series:
     known = {series.axis: series for series in all_series}
     if axis not in cell.axis_names:
         raise UsageError(
-            "axis", found=repr(axis), expected=f"one of {', '.join(cell.axis_names)}", remedy="give its name"
+            "axis",
+            found=repr(axis),
+            expected=f"one of {', '.join(cell.axis_names)}",
+            remedy="give its name",
         )
     if axis not in known or not known[axis].points:
         raise UsageError(
@@ -413,7 +508,9 @@ def _named(all_series: tuple[Series, ...], axis: str, cell: Cell) -> Series:
     return known[axis]
 
 
-def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
+def _write_files(
+    chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None
+) -> None:
     from daq.report.history import csv_text, plot_history
 
     drawn = [series for series in chosen if series.points]

@@ -1,4 +1,7 @@
-"""Where a guided session is: its stage, the next step of the operator, and how σ falls. For terminal and console."""
+"""Where a guided session is: its stage, the next step of the operator, and how σ falls.
+
+For terminal and console.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,10 @@ def position_of(state: GuidedState) -> Position:
     if recording is not None:
         return recording
     if state.outcome is Outcome.APPLIED and state.acceptance is None:
-        return Position(StageName.ACCEPT, f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new")
+        return Position(
+            StageName.ACCEPT,
+            f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new",
+        )
     if state.outcome is not None and state.outcome.good:
         return Position(StageName.ACCEPT, "nothing: the certificate is being made")
     if state.decision is None:
@@ -76,7 +82,9 @@ def _recording_position(state: GuidedState) -> Position | None:
     recorded = {run.name for run in state.runs}
     waiting = [block for block in state.blocks if block.name not in recorded]
     if waiting:
-        return Position(StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}")
+        return Position(
+            StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}"
+        )
     if not state.complete:
         return Position(StageName.RECORD, "nothing yet: the next block is being prepared")
     return None

@@ -1,8 +1,9 @@
 """The ledger of a cell: its audit log, and the history that is folded from it.
 
-Everything is written once, into the audit log. `record_write` is for `apply` and `rollback` of `daq.writeback.target`
-alone: whoever writes gains calls these. A history of an earlier version, in SQLite, is taken into the audit log by the
-first command that enters or shows the history (`migrate`).
+Everything is written once, into the audit log. `record_write` is for `apply` and `rollback` of
+`daq.writeback.target` alone: whoever writes gains calls these. A history of an earlier version, in
+SQLite, is taken into the audit log by the first command that enters or shows the history
+(`migrate`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.same_cell import calibrated_robot, mismatch_of_robot
 from daq.documents.calibration_file import encode_calibration
-from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, reason_of, writing
+from daq.errors import (
+    DataError,
+    HistoryInaccessible,
+    HistoryUnreadable,
+    OutputFailed,
+    evidence,
+    reason_of,
+    writing,
+)
 from daq.files import fsync_folder
 from daq.ledger.audit import (
     AuditAction,
@@ -91,11 +100,14 @@ class Ledger:
 
     cell: Cell  #: as it is now
     audit: Path  #: the audit log
-    stored: Path | None = None  #: history of an earlier version; None where the cell cannot have one
+    #: history of an earlier version; None where the cell cannot have one
+    stored: Path | None = None
 
     @classmethod
     def of(cls, cell: Cell, audit: Path | None = None) -> Ledger | None:
-        """The ledger of a cell, or that of another audit log; None for a cell from a log without either."""
+        """The ledger of a cell, or that of another audit log;
+        None for a cell from a log without either.
+        """
         place = cell.history
         if place is not None and audit in {None, place.audit}:
             return cls(cell, place.audit, place.store)
@@ -114,9 +126,11 @@ class Verification:
     audit: Path  #: the audit log
     verdict: AuditVerdict  #: on it
     history: History  #: as far as it can be read
-    broken: tuple[str, ...]  #: what the history cannot show, and what a history of an earlier version says otherwise
+    #: what the history cannot show, and what a history of an earlier version says otherwise
+    broken: tuple[str, ...]
     unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
-    noted: bool = True  #: whether the last entry of the audit log is noted, without which a missing end does not show
+    #: whether the last entry of the audit log is noted, without which a missing end does not show
+    noted: bool = True
 
     @property
     def complete(self) -> bool:
@@ -130,18 +144,21 @@ class Migrated:
 
     entries: int  #: number of entries that the audit log got
     aside: Path | None  #: new name of the file; None where there was none
-    flaws: tuple[str, ...] = ()  #: why nothing was taken over from it, as sentences; empty where it is sound
+    #: why nothing was taken over from it, as sentences; empty where it is sound
+    flaws: tuple[str, ...] = ()
 
 
 MAY_LACK = (
-    "the audit log is not what was written, so the history may lack something: `drivegain history CELL --verify` says "
+    "the audit log is not what was written, so the history may lack something: `drivegain history "
+    "CELL --verify` says "
     "what"
 )
 """What a reader of a history with `may_lack` must know."""
 
 
 def read_history(ledger: Ledger) -> History:
-    """Read the history of a cell, as far as the audit log is what was written (`may_lack`); nothing is written.
+    """Read the history of a cell, as far as the audit log is what was written (`may_lack`);
+    nothing is written.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
@@ -156,7 +173,8 @@ def read_history(ledger: Ledger) -> History:
 
 
 def names_of(cell: Cell) -> frozenset[str]:
-    """Return the name of a cell, and those that it had before its audit log says that it was renamed.
+    """Return the name of a cell, and those that it had before its audit log says that it was
+    renamed.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
@@ -181,7 +199,8 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
 
     Args:
         ledger: to check.
-        heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note beside it.
+        heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note
+            beside it.
 
     Raises:
         AuditUnusable, HistoryUnreadable: see `read_history`.
@@ -194,16 +213,25 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
-    known = {one.digest for one in history.entries} | {one.entry.digest for one in history.other_robots}
+    known = {one.digest for one in history.entries} | {
+        one.entry.digest for one in history.other_robots
+    }
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
     is_noted = bool(noted) or not verdict.entries
     return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
 
 
 def record_write(
-    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    audit: Path,
+    action: AuditAction,
+    *,
+    at: datetime,
+    who: str,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
-    """Enter one step of a write to a controller; only `apply` and `rollback` of `daq.writeback.target` do.
+    """Enter one step of a write to a controller;
+    only `apply` and `rollback` of `daq.writeback.target` do.
 
     Raises:
         ValueError: the action is none of `WRITES`.
@@ -215,7 +243,13 @@ def record_write(
 
 
 def record_session(
-    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    audit: Path,
+    action: AuditAction,
+    *,
+    at: datetime,
+    who: str,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
     """Enter a step of a session, which writes to no controller.
 
@@ -229,8 +263,11 @@ def record_session(
         return append(audit, action, at=at, who=who, subject=subject, details=details)
 
 
-def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime) -> bool:
-    """Enter a calibration, with the SHA-256 of its file, and writes whose writer was killed before it ended them.
+def enter_calibration(
+    ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime
+) -> bool:
+    """Enter a calibration, with the SHA-256 of its file,
+    and writes whose writer was killed before it ended them.
 
     A history of an earlier version is migrated first, but not into an audit log that was changed.
 
@@ -265,13 +302,18 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
         if calibration.robot is not None:
             details["robot"] = asdict(calibration.robot)
         _append(
-            ledger, EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details)
+            ledger,
+            EntryDraft(
+                AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details
+            ),
         )
     _end_found_writes(ledger)
     return new
 
 
-def acknowledge(ledger: Ledger, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
+def acknowledge(
+    ledger: Ledger, axis: str, *, since: datetime, at: datetime, who: str, why: str
+) -> None:
     """Enter that a change of a gain is explained.
 
     Args:
@@ -310,8 +352,8 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
         old: the name before.
 
     Raises:
-        DataError: the audit log is not what was written, has nothing under the old name, or has calibrations of
-            another robot under one of the two names.
+        DataError: the audit log is not what was written, has nothing under the old name, or has
+            calibrations of another robot under one of the two names.
         AuditUnusable: the audit log is no regular file, or it cannot be read.
     """
     new = ledger.cell.name
@@ -330,7 +372,8 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
             str(ledger.audit),
             found=f"nothing of a cell {old!r}; cells in it: {known}",
             expected=f"the history of the cell that is called {new!r} now",
-            remedy="give its earlier name as the audit log has it, or correct `history.audit` of the cell file",
+            remedy="give its earlier name as the audit log has it, or correct `history.audit` of "
+            "the cell file",
         )
     return PlannedRename(
         old=old,
@@ -344,7 +387,8 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
 
 
 def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetime) -> None:
-    """Enter that a cell has another name: one entry, which counts for all that was entered before it.
+    """Enter that a cell has another name:
+    one entry, which counts for all that was entered before it.
 
     Raises:
         AuditUnusable, OutputFailed: it could not be recorded.
@@ -360,7 +404,9 @@ def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetim
 
 
 def _entered_rename_at(entries: Sequence[AuditEntry], old: str, new: str) -> datetime | None:
-    """Return when a cell gave up a name that it had before its present one; None where the entry has no time."""
+    """Return when a cell gave up a name that it had before its present one;
+    None where the entry has no time.
+    """
     own = [rename for rename in renames_to(entries, new) if rename.old == old]
     found = None
     for one in entries:
@@ -390,15 +436,16 @@ def _require_own_robot(ledger: Ledger, history: History) -> None:
             str(ledger.audit),
             found=found,
             expected=expected,
-            remedy="two robots have no common history: give the earlier name of this robot; nothing was entered",
+            remedy="two robots have no common history: give the earlier name of this robot; "
+            "nothing was entered",
         )
 
 
 def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
     """Take what only a history of an earlier version has into the audit log, and rename its file.
 
-    A process that is killed in between leaves the file; the next one enters what is still missing. Calibrations that
-    an earlier version has entered get their figures.
+    A process that is killed in between leaves the file; the next one enters what is still missing.
+    Calibrations that an earlier version has entered get their figures.
 
     Args:
         ledger: of the cell.
@@ -408,7 +455,8 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
             add figures where there is no such file.
 
     Raises:
-        HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was changed.
+        HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was
+            changed.
         HistoryUnreadable: the file is broken, without `forced`; nothing was changed.
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
@@ -473,18 +521,29 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
             str(audit),
             found=f"no file; {first.says}",
             expected="the audit log with these entries",
-            remedy="restore it from a backup; if there is none, begin a new log (another name in `history.audit`)",
+            remedy="restore it from a backup; if there is none, begin a new log (another name in "
+            "`history.audit`)",
         )
     cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
-    note = f" (if the entries that are missing are of another log, remove {head_file(audit)})" if cut_off else ""
-    places = "1 place that is" if len(verdict.flaws) == 1 else f"{len(verdict.flaws)} places that are"
-    more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
+    if cut_off:
+        note = f" (if the entries that are missing are of another log, remove {head_file(audit)})"
+    else:
+        note = ""
+    if len(verdict.flaws) == 1:
+        places = "1 place that is"
+    else:
+        places = f"{len(verdict.flaws)} places that are"
+    more = "".join(
+        f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws
+    )
     return DataError(
         f"{audit}, line {first.line}",
         found=f"{places} not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
-        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; until that is "
-        "known trust the controller's file by its backups only, and begin another log under a new name "
+        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "
+        "until that is "
+        "known trust the controller's file by its backups only, and begin another log under a "
+        "new name "
         "(`history.audit`)",
     )
 
@@ -497,8 +556,10 @@ def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
         str(ledger.stored),
         found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
         expected="a sound SQLite file whose calibrations can be read",
-        remedy="ask who can write to it, and restore the last good one from a backup, or go on without it: "
-        "`drivegain history CELL --migrate` keeps it under another name, and takes nothing over from it",
+        remedy="ask who can write to it, and restore the last good one from a backup, or go on "
+        "without it: "
+        "`drivegain history CELL --migrate` keeps it under another name, and takes nothing "
+        "over from it",
     )
 
 
@@ -508,7 +569,9 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
     return read_stored(ledger.stored)
 
 
-def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
+def _with_stored(
+    entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell
+) -> tuple[AuditEntry, ...]:
     """Return the entries as they will be once a history of an earlier version is migrated."""
     chain = list(entries)
     never = datetime.min.replace(tzinfo=UTC)  # these entries are only folded
@@ -522,12 +585,18 @@ def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cel
 def _append(ledger: Ledger, draft: EntryDraft) -> AuditEntry:
     with writing(ledger.audit):
         return append(
-            ledger.audit, draft.action, at=draft.at, who=draft.who, subject=draft.subject, details=draft.details
+            ledger.audit,
+            draft.action,
+            at=draft.at,
+            who=draft.who,
+            subject=draft.subject,
+            details=draft.details,
         )
 
 
 def _end_found_writes(ledger: Ledger) -> None:
-    """Enter the writes without an end whose content the controller has now, in the name of their writers.
+    """Enter the writes without an end whose content the controller has now,
+    in the name of their writers.
 
     Nothing is concluded from an audit log that was changed.
     """
@@ -568,7 +637,9 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
         expected = robot.expected
         remedy = "give the cell file of the robot that was calibrated; nothing was entered"
     elif history.renamed is not None:
-        found = f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
+        found = (
+            f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
+        )
         expected = f"{history.renamed.new!r}, its name since"
         remedy = "give the cell file with the new name; nothing was entered"
     elif history.other_robots:
@@ -608,10 +679,12 @@ class Standing:
 
     as_of: datetime | None  #: when the ledger was read, with zone; None where it was not
     unknown: str = ""  #: why it was not, in words; empty where it was
-    write: Event | None = None  #: last write of its gains, one that is in force if there is any; None if never written
+    #: last write of its gains, one that is in force if there is any; None if never written
+    write: Event | None = None
     #: Next write or rollback at the same place; None while the gains are in force.
     ended: Event | None = None
-    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have them.
+    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have
+    #: them.
     before: Mapping[str, float] = field(default_factory=dict)
     acceptance: RecordedAcceptance | None = None  #: result of the last new moves with these gains
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
@@ -632,14 +705,17 @@ class Standing:
         return StandingState.NOT_WRITTEN
 
 
-def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | None = None) -> Standing:
+def read_standing(
+    ledger: Ledger, digest: str, as_of: datetime, place: str | None = None
+) -> Standing:
     """Read the state of a calibration from the ledger of its cell.
 
     Args:
         ledger: of the cell.
         digest: SHA-256 of the calibration's file.
         as_of: time now, with zone.
-        place: controller's file, whose write counts before others where it is in force; None for any place.
+        place: controller's file, whose write counts before others where it is in force; None for
+            any place.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
@@ -666,7 +742,9 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
 
 
 def _last_write(history: History, digest: str, place: str | None) -> Event | None:
-    """Return the last write of a calibration's gains, one that is in force if there is any, and `place` first."""
+    """Return the last write of a calibration's gains, one that is in force if there is any,
+    and `place` first.
+    """
     newest = {event.target: event for event in history.events}
     in_force = [event for event in newest.values() if event.digest == digest]
     here = [event for event in in_force if event.target == place]
@@ -676,19 +754,24 @@ def _last_write(history: History, digest: str, place: str | None) -> Event | Non
 
 
 def _next_at_its_place(history: History, write: Event) -> Event | None:
-    """Return the write or rollback that followed a write at the same place; None where there was none."""
+    """Return the write or rollback that followed a write at the same place;
+    None where there was none.
+    """
     later = history.events[history.events.index(write) + 1 :]
     return next((event for event in later if event.target == write.target), None)
 
 
 def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, float]:
-    """Return the previous gains, those before a write, by axis; none where the audit log lacks them."""
+    """Return the previous gains, those before a write, by axis;
+    none where the audit log lacks them.
+    """
     by_digest = {entry.sha256: entry for entry in entries}
     by_number = {entry.number: entry for entry in entries}
     ended = by_digest.get(write.audit or "")
     if ended is None:
         return {}
-    # The end names the begin, which has the numbers; a write that its killed writer did not end is the begin itself.
+    # The end names the begin, which has the numbers; a write that its killed writer did not end is
+    # the begin itself.
     begun = by_number.get(begun_by(ended), ended)
     changes = begun.details.get("changes")
     if not isinstance(changes, list):

@@ -1,8 +1,9 @@
 """Read joint states from ROS bags as tables.
 
-A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
-stamp that hold different joints make one row, because several publishers may share a topic. Several that publish the
-same joints differ in frame, joints or fields, and the import description chooses one of them.
+A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`.
+Messages of one stamp that hold different joints make one row, because several publishers may share
+a topic. Several that publish the same joints differ in frame, joints or fields, and the import
+description chooses one of them.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
 METADATA = "metadata.yaml"  #: Of a bag in its folder
 LARGEST_METADATA = 64 * 2**20
-PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")  #: Files of a bag in its folder
+#: Files of a bag in its folder
+PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")
 
 
-def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+def read_bag(
+    path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None
+) -> Table:
     """Read columns of a bag, which is a file or a folder of several.
 
     Raises:
@@ -48,8 +52,15 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     """
     if time is not None and (time.column != STAMP or time.unit is not TimeUnit.NANOSECOND):
         found = f"time column {time.column!r} in {time.unit.value}"
-        raise _unfit(path, found, f"`column: {STAMP}` and `unit: ns`", "correct `time` in the import description")
-    rows = _Rows(path, tuple(_field_and_joint(path, column) for column in columns), wanted.publisher)
+        raise _unfit(
+            path,
+            found,
+            f"`column: {STAMP}` and `unit: ns`",
+            "correct `time` in the import description",
+        )
+    rows = _Rows(
+        path, tuple(_field_and_joint(path, column) for column in columns), wanted.publisher
+    )
     topics: dict[str, bool] = {}
     for file in _files(path):
         with open_bag(file) as bag, closing(bag.messages()) as messages:
@@ -62,14 +73,26 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
                         state = joint_state_from_cdr(unpack_message(message.data))
                         rows.add(state, message.time_ns, topic.publisher)
                     except ValueError as error:
-                        raise bag.corrupt(message.place, f"{topic.name} with {error}", JOINTS_SCHEMA) from error
+                        raise bag.corrupt(
+                            message.place, f"{topic.name} with {error}", JOINTS_SCHEMA
+                        ) from error
     used = [topic for topic, chosen in topics.items() if chosen]
     if not used:
-        found = f"topics {', '.join(topics)}" if topics else "no message"
-        raise _unfit(path, found, f"{wanted.topic or 'a topic'} of type {JOINTS_SCHEMA}", "is this the right bag?")
+        if topics:
+            found = f"topics {', '.join(topics)}"
+        else:
+            found = "no message"
+        raise _unfit(
+            path,
+            found,
+            f"{wanted.topic or 'a topic'} of type {JOINTS_SCHEMA}",
+            "is this the right bag?",
+        )
     if len(used) > 1:
         remedy = "choose one in the import description: `topic: NAME`"
-        raise _unfit(path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy)
+        raise _unfit(
+            path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy
+        )
     return rows.table(columns, time, wanted.keep)
 
 
@@ -86,7 +109,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _require_parts(folder: Path, files: list[Path]) -> None:
-    """Refuse a folder that lacks a file which the recorder names: without it, the recording would end early.
+    """Refuse a folder that lacks a file which the recorder names:
+    without it, the recording would end early.
 
     Raises:
         TableUnfit: a file is not there.
@@ -100,12 +124,14 @@ def _require_parts(folder: Path, files: list[Path]) -> None:
             str(folder),
             found=f"no {', '.join(missing)}, which {METADATA} names",
             expected=f"all {counted(len(named), 'file')} of the bag",
-            remedy=f"copy the folder again; if the file was removed on purpose, take its name out of {METADATA}",
+            remedy="copy the folder again; if the file was removed on purpose, take its name out "
+            f"of {METADATA}",
         )
 
 
 def _named_parts(metadata: Path) -> list[str]:
-    """Return the files of a bag by its metadata, none if there are none; the rest of it is not read.
+    """Return the files of a bag by its metadata, none if there are none;
+    the rest of it is not read.
 
     It may hold megabytes of quality of service, which no reader of YAML bounds.
     """
@@ -133,7 +159,10 @@ def _part(file: Path) -> tuple[int, str]:
 
 
 def _unfit(
-    path: Path, found: str, expected: str, remedy: str = "correct `columns` in the import description"
+    path: Path,
+    found: str,
+    expected: str,
+    remedy: str = "correct `columns` in the import description",
 ) -> TableUnfit:
     return TableUnfit(str(path), found=found, expected=expected, remedy=remedy)
 
@@ -147,7 +176,9 @@ def _field_and_joint(path: Path, column: Column) -> tuple[str, str]:
 
 @dataclass(slots=True)
 class _Publisher:
-    """Messages that one node may have published: they have one frame, one set of joints and the same fields."""
+    """Messages that one node may have published:
+    they have one frame, one set of joints and the same fields.
+    """
 
     number: int  #: from 1, in the order of their first messages
     node: str  #: its name, where the bag has it
@@ -165,36 +196,50 @@ class _Publisher:
 
     def __str__(self) -> str:
         fields = " and ".join(self.fields) or "no values"
-        frame = "without a header" if self.frame is None else f"frame {self.frame!r}"
+        if self.frame is None:
+            frame = "without a header"
+        else:
+            frame = f"frame {self.frame!r}"
         joints = ", ".join(sorted(self.joints))
         node = f"{self.node}, " if self.node else ""
-        return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
+        return (
+            f"{self.number}: {node}{fields} of {joints}, {frame}, "
+            f"{counted(self.messages, 'message')}"
+        )
 
 
 SEPARATE = (
-    "no message has all fields, and messages of different publishers are not joined: write each field to a CSV file, "
+    "no message has all fields, and messages of different publishers are not joined: write each "
+    "field to a CSV file, "
     "with rows of the same instants, and name the files by `file` of `position` and `current`"
 )
 FEWEST_OF_A_PUBLISHER = 10  #: Messages by which its rhythm is known
-EVEN_SHARE = 0.05  #: Largest difference of a step from the usual one in an even row of stamps, as a share of it
-CENTRED_SHARE = 0.35  #: Offset of a second row, as a share of the step, above which it may be every other stamp of one
+#: Largest difference of a step from the usual one in an even row of stamps, as a share of it
+EVEN_SHARE = 0.05
+#: Offset of a second row, as a share of the step, above which it may be every other stamp of one
+CENTRED_SHARE = 0.35
 MOSTLY = 0.95  #: Share of the steps that are even in such a row
-SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
+#: Stamps from here on, 2001, are times of day; earlier ones are since some start
+SINCE_1970_NS = 10**18
 UNDECIDED = 1000  #: Messages with a stamp of 0 that wait for a later one, which says what 0 means
 
 
 class _Rows:
     """Rows of joint states: a message begins one, or completes that of its stamp.
 
-    A stamp of 0 is the first instant of a clock that starts at 0, as simulation time does, or the stamp that a
-    publisher left out. The first other stamp of the bag tells the two apart.
+    A stamp of 0 is the first instant of a clock that starts at 0, as simulation time does, or the
+    stamp that a publisher left out. The first other stamp of the bag tells the two apart.
     """
 
-    def __init__(self, path: Path, columns: tuple[tuple[str, str], ...], publisher: int | None) -> None:
+    def __init__(
+        self, path: Path, columns: tuple[tuple[str, str], ...], publisher: int | None
+    ) -> None:
         """Store the columns, each with field and joint, and the publisher that is chosen."""
         self._path = path
         self._chosen = publisher
-        self._publishers: dict[tuple[str, str | None, frozenset[str], tuple[str, ...]], _Publisher] = {}
+        self._publishers: dict[
+            tuple[str, str | None, frozenset[str], tuple[str, ...]], _Publisher
+        ] = {}
         self._zero_is_a_time: bool | None = None  # None until a stamp has shown it
         self._undecided: list[tuple[JointState, int]] = []  # with the time of their recording
         self._columns = columns
@@ -202,7 +247,8 @@ class _Rows:
         self._values = array("d")
         self._present = bytearray()
         self._begun: dict[int, int] = {}  # incomplete rows by their stamp
-        self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}  # field, index and column, by the names
+        # Field, index and column, by the names
+        self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}
         self._unstamped = 0
 
     def add(self, state: JointState, log_time_ns: int, node: str) -> None:
@@ -215,7 +261,12 @@ class _Rows:
         if state.names not in self._places:
             if len(set(state.names)) < len(state.names):
                 twice = next(name for name in state.names if state.names.count(name) > 1)
-                raise _unfit(self._path, f"joint {twice} twice in one message", "each joint once", "mend its publisher")
+                raise _unfit(
+                    self._path,
+                    f"joint {twice} twice in one message",
+                    "each joint once",
+                    "mend its publisher",
+                )
             self._places[state.names] = [
                 (field, state.names.index(joint), column)
                 for column, (field, joint) in enumerate(self._columns)
@@ -240,10 +291,15 @@ class _Rows:
     def _publisher_of(self, state: JointState, node: str) -> _Publisher:
         fields = tuple(field for field in FIELDS if getattr(state, field))
         joints = frozenset(state.names)
-        frame = None if not state.frame and state.stamp_ns == 0 else state.frame
+        if not state.frame and state.stamp_ns == 0:
+            frame = None
+        else:
+            frame = state.frame
         key = (node, frame, joints, fields)
         if key not in self._publishers:
-            self._publishers[key] = _Publisher(len(self._publishers) + 1, node, frame, joints, fields)
+            self._publishers[key] = _Publisher(
+                len(self._publishers) + 1, node, frame, joints, fields
+            )
         return self._publishers[key]
 
     def _decide(self, *, zero_is_a_time: bool) -> None:
@@ -274,8 +330,12 @@ class _Rows:
         for field, index, column in places:
             numbers: tuple[float, ...] = getattr(state, field)
             if index >= len(numbers):
-                found = f"a message with {len(state.names)} names and {len(numbers)} values of {field}"
-                raise _unfit(self._path, found, "one value a joint", "does this controller publish it?")
+                found = (
+                    f"a message with {len(state.names)} names and {len(numbers)} values of {field}"
+                )
+                raise _unfit(
+                    self._path, found, "one value a joint", "does this controller publish it?"
+                )
             self._values[row * width + column] = numbers[index]
             self._present[row * width + column] = 1
         if all(self._present[row * width : (row + 1) * width]):
@@ -285,7 +345,8 @@ class _Rows:
         """Refuse joints that several nodes publish, and fields that no node publishes.
 
         Raises:
-            TableUnfit: several publish the same joints, the chosen one is not there, or a field has no values.
+            TableUnfit: several publish the same joints, the chosen one is not there, or a field has
+                no values.
         """
         known = list(self._publishers.values())
         if self._chosen is not None:
@@ -308,21 +369,32 @@ class _Rows:
             fullest = self._fullest(sharing)
             is_full = {field for field, _ in self._columns} <= set(fullest.fields)
             choose = (
-                f"choose one in the import description, as in `publisher: {fullest.number}`, or record again without "
+                f"choose one in the import description, as in `publisher: {fullest.number}`, or "
+                "record again without "
                 "the others"
             )
             raise _unfit(
                 self._path,
-                f"{len(sharing)} publishers of the same joints on one topic: {'; '.join(map(str, sharing))}",
+                f"{len(sharing)} publishers of the same joints on one topic: "
+                f"{'; '.join(map(str, sharing))}",
                 "one publisher of each joint",
                 choose if is_full else SEPARATE,
             )
         for one in known:
-            lacking = [field for field, joint in self._columns if joint in one.joints and field not in one.fields]
+            lacking = [
+                field
+                for field, joint in self._columns
+                if joint in one.joints and field not in one.fields
+            ]
             if lacking:
                 found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
-                is_elsewhere = any(lacking[0] in other.fields for other in self._publishers.values())
-                remedy = SEPARATE if is_elsewhere else "does this controller publish it?"
+                is_elsewhere = any(
+                    lacking[0] in other.fields for other in self._publishers.values()
+                )
+                if is_elsewhere:
+                    remedy = SEPARATE
+                else:
+                    remedy = "does this controller publish it?"
                 raise _unfit(self._path, found, "one value a joint", remedy)
 
     def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
@@ -330,11 +402,14 @@ class _Rows:
         fields = {field for field, _ in self._columns}
         return max(publishers, key=lambda one: (len(fields & set(one.fields)), one.messages))
 
-    def table(self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None) -> Table:
+    def table(
+        self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None
+    ) -> Table:
         """Return the complete rows of the part that is kept.
 
         Raises:
-            TableUnfit: a joint is missing in every row or between complete ones, or a number is not finite.
+            TableUnfit: a joint is missing in every row or between complete ones, or a number is not
+                finite.
         """
         self._decide(zero_is_a_time=self._zero_is_a_time is True)
         self._require_one_publisher()
@@ -348,7 +423,10 @@ class _Rows:
         is_number = present & ~np.isnan(values)
         self._require_joints(columns, present, is_number)
         whole = np.flatnonzero(is_number.all(axis=1))
-        inside = slice(whole[0], whole[-1] + 1) if whole.size else slice(0, 1)
+        if whole.size:
+            inside = slice(whole[0], whole[-1] + 1)
+        else:
+            inside = slice(0, 1)
         if not whole.size or len(whole) < len(is_number[inside]):
             row = int(np.argmin(is_number[inside].all(axis=1))) + inside.start
             raise self._incomplete_row(columns, stamp_ns[row], present[row], is_number[row])
@@ -358,7 +436,15 @@ class _Rows:
         stamps = None if time is None else clock
         digest = digest_of(values[inside], clock)
         first_row = kept.start + inside.start
-        table = Table(self._path, columns, values[inside], digest, stamps, first_row=first_row, remarks=remarks)
+        table = Table(
+            self._path,
+            columns,
+            values[inside],
+            digest,
+            stamps,
+            first_row=first_row,
+            remarks=remarks,
+        )
         return require_finite(table)
 
     def _require_one_rhythm(self, time_s: FloatArray) -> None:
@@ -372,10 +458,12 @@ class _Rows:
             return
         raise _unfit(
             self._path,
-            f"stamps of two publishers of the same joints: {found.first} messages each {found.first_step_s:.6g} s, and "
+            f"stamps of two publishers of the same joints: {found.first} messages each "
+            f"{found.first_step_s:.6g} s, and "
             f"{found.second} messages each {found.second_step_s:.6g} s between them",
             "one publisher of each joint",
-            "record again with one of the two nodes stopped, or give one of them another topic or `frame_id`: then "
+            "record again with one of the two nodes stopped, or give one of them another topic or "
+            "`frame_id`: then "
             "`topic` or `publisher` of the import description chooses it",
         )
 
@@ -389,16 +477,25 @@ class _Rows:
             require_kept(self._path, count, rows)
         return slice(*rows.indices(count))
 
-    def _require_joints(self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray) -> None:
+    def _require_joints(
+        self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray
+    ) -> None:
         """Refuse joints that no message has, and fields that are never a number."""
         absent = [str(columns[number]) for number in np.flatnonzero(~present.any(axis=0))]
         if absent:
-            joints = sorted({name for names in self._places for name in names})
-            raise _unfit(self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}")
+            found: set[str] = set()
+            for names in self._places:
+                found.update(names)
+            joints = sorted(found)
+            raise _unfit(
+                self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}"
+            )
         empty = [str(columns[number]) for number in np.flatnonzero(~is_number.any(axis=0))]
         if empty:
             remedy = "does this controller measure it? name a field that it publishes"
-            raise _unfit(self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy)
+            raise _unfit(
+                self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy
+            )
 
     def _incomplete_row(
         self, columns: tuple[Column, ...], stamp_ns: int, present: BoolArray, is_number: BoolArray
@@ -411,14 +508,16 @@ class _Rows:
                 self._path,
                 f"no {', '.join(absent)} {at}",
                 "all joints in messages of the same stamp",
-                "messages are missing, or joints are stamped apart: record a topic that has all joints in each message",
+                "messages are missing, or joints are stamped apart: record a topic that has all "
+                "joints in each message",
             )
         empty = [str(columns[number]) for number in np.flatnonzero(~is_number)]
         return _unfit(
             self._path,
             f"nan for {', '.join(empty)} {at}",
             "numbers, but for the begin and the end of the bag",
-            "samples are never invented: import what is before it and what is behind it by `keep`, as recordings of "
+            "samples are never invented: import what is before it and what is behind it by `keep`, "
+            "as recordings of "
             "their own",
         )
 
@@ -431,9 +530,14 @@ class _Rows:
         lacking = int(np.count_nonzero(is_outside & ~has_joints))
         empty = int(np.count_nonzero(is_outside & has_joints))
         if lacking:
-            remarks.append(f"left out, as joints are missing at the ends of the bag: {counted(lacking, 'stamp')}")
+            remarks.append(
+                "left out, as joints are missing at the ends of the bag: "
+                f"{counted(lacking, 'stamp')}"
+            )
         if empty:
-            remarks.append(f"left out, as values are nan at the ends of the bag: {counted(empty, 'stamp')}")
+            remarks.append(
+                f"left out, as values are nan at the ends of the bag: {counted(empty, 'stamp')}"
+            )
         if self._unstamped:
             unstamped = counted(self._unstamped, "message")
             remarks.append(f"{unstamped} without a stamp: the time of the recording is used")
@@ -456,7 +560,8 @@ class Interleaved:
 def interleaved(time_s: FloatArray) -> Interleaved | None:
     """Return what two publishers left, each of which stamps evenly; None for the stamps of one.
 
-    One publisher may be uneven, but what is left when an even row of its stamps is taken out is not even as well.
+    One publisher may be uneven, but what is left when an even row of its stamps is taken out is not
+    even as well.
 
     Args:
         time_s: stamps in the order of the messages, shape (k,).
@@ -503,7 +608,9 @@ def _is_even(time_s: FloatArray) -> bool:
     """Whether most steps are the usual one, over all of the time."""
     steps_s = np.diff(time_s)
     usual_s = float(np.median(steps_s))
-    return usual_s > 0.0 and bool(np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY)
+    return usual_s > 0.0 and bool(
+        np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY
+    )
 
 
 def _require_possible(time_ns: int) -> None:

@@ -1,7 +1,9 @@
-"""A CSV file as lines: its header, its line of units, its rows of numbers, and what is none of these.
+"""A CSV file as lines: its header, its line of units, its rows of numbers,
+and what is none of these.
 
-Lines that are empty, or begin with the sign of a comment, are left out before and after the rows. Among the rows they
-may part two recordings, so there they are refused, unless the import description says what they are.
+Lines that are empty, or begin with the sign of a comment, are left out before and after the rows.
+Among the rows they may part two recordings, so there they are refused, unless the import
+description says what they are.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from daq.log.column_units import check_units, column_unit_of, expected_units
 from daq.log.table import unreadable
 
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
-LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
+#: Largest step to a last number that may be cut off, in multiples of the largest step before it
+LARGEST_JUMP = 3.0
 COMMENT_SIGNS = ("#", "%", "//")  #: Of lines before and after the rows
 SHOWN = 40  #: Characters of a line in a message
 MINUS = "\u2212"  #: The minus sign of typography, which spreadsheets write
@@ -43,7 +46,8 @@ class CsvLines:
     first_row: int  #: rows that were cut off before the first one
 
     def fields(self, row: str) -> list[str]:
-        """Split a line into fields without quotes and white space; a delimiter between quotes belongs to its field.
+        """Split a line into fields without quotes and white space;
+        a delimiter between quotes belongs to its field.
 
         Raises:
             csv.Error: a quote is not closed.
@@ -73,7 +77,10 @@ class CsvLines:
             if column <= width:
                 return column - 1
             raise TableUnfit(
-                str(self.path), found=f"{width} columns", expected=f"a column {column}", remedy="columns count from 1"
+                str(self.path),
+                found=f"{width} columns",
+                expected=f"a column {column}",
+                remedy="columns count from 1",
             )
         if self.names.count(column) == 1:
             return self.names.index(column)
@@ -88,14 +95,21 @@ class CsvLines:
         """Return some of the rows."""
         first, _, _ = rows.indices(len(self.rows))
         kept = self.rows[rows]
-        return CsvLines(self.path, self.table, self.names, kept, self.numbers[rows], self.first_row + first)
+        return CsvLines(
+            self.path, self.table, self.names, kept, self.numbers[rows], self.first_row + first
+        )
 
 
 def split_fields(row: str, delimiter: str) -> list[str]:
     """Split a line into fields; see `CsvLines.fields`."""
     if '"' not in row:
-        return row.split() if delimiter == " " else [part.strip() for part in row.split(delimiter)]
-    text = " ".join(row.split()) if delimiter == " " else row.strip(" ")
+        if delimiter == " ":
+            return row.split()
+        return [part.strip() for part in row.split(delimiter)]
+    if delimiter == " ":
+        text = " ".join(row.split())
+    else:
+        text = row.strip(" ")
     reader = csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True)
     return [part.strip() for part in next(reader)]
 
@@ -122,8 +136,8 @@ def read_lines(
         time: the time column, if it is in this file.
 
     Raises:
-        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row, or has another number of fields;
-            its line of units contradicts the import description.
+        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row, or has
+            another number of fields; its line of units contradicts the import description.
     """
     try:
         data = read_regular(path, LARGEST_BYTES)
@@ -132,7 +146,11 @@ def read_lines(
     text, *remarks = _decoded(path, data)
     has_last_end = text.endswith(("\n", "\r"))
     file = _Parts(path, wanted.table, text.splitlines())
-    named = [column for column in (*columns, *([] if time is None else [time.column])) if isinstance(column, str)]
+    named = [
+        column
+        for column in (*columns, *([] if time is None else [time.column]))
+        if isinstance(column, str)
+    ]
     start, names = file.head(named)
     units_line = file.units_line(start, names, columns)
     expected = tuple(expected_units(path, wanted, time))
@@ -141,11 +159,15 @@ def read_lines(
     else:
         check_units(f"{path}:{units_line + 1}", file.fields(units_line), names, expected)
         start = units_line + 1
-        remarks.append(f"line {start} was taken for the units of the columns: {file.shown(units_line)}")
+        remarks.append(
+            f"line {start} was taken for the units of the columns: {file.shown(units_line)}"
+        )
     end = file.end(start)
     beyond = [number for number in range(end, len(file.lines)) if file.lines[number].strip()]
     if beyond:
-        remarks.append(f"left out after the rows: {counted(len(beyond), 'line')}, {file.shown(beyond[0])}")
+        remarks.append(
+            f"left out after the rows: {counted(len(beyond), 'line')}, {file.shown(beyond[0])}"
+        )
     numbers, skipped = file.row_numbers(start, end, has_time=wanted.time is not None)
     remarks += skipped
     rows = slice(None) if wanted.keep is None else wanted.keep.rows
@@ -175,7 +197,9 @@ def _without_rows(file: _Parts, start: int, rows: int, wanted: ImportDescription
     if rows and wanted.keep is not None:
         found = f"{counted(rows, 'row')} of numbers, none of them in `keep`"
         remedy = "correct `keep` in the import description"
-    return TableUnfit(str(file.path), found=found, expected="a line of numbers for each sample", remedy=remedy)
+    return TableUnfit(
+        str(file.path), found=found, expected="a line of numbers for each sample", remedy=remedy
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,18 +223,22 @@ class _Parts:
 
     def is_comment(self, number: int) -> bool:
         """Whether a line begins with the sign of a comment."""
-        signs = COMMENT_SIGNS if self.table.comment is None else (*COMMENT_SIGNS, self.table.comment)
+        signs = (
+            COMMENT_SIGNS if self.table.comment is None else (*COMMENT_SIGNS, self.table.comment)
+        )
         return self.lines[number].lstrip().startswith(signs)
 
     def is_row(self, number: int) -> bool:
         """Whether a line has a number."""
-        return any(math.isfinite(read_number(field, self.table.decimal)) for field in self.fields(number))
+        return any(
+            math.isfinite(read_number(field, self.table.decimal)) for field in self.fields(number)
+        )
 
     def head(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
         """Return the first line behind the header, and its names.
 
-        A header may begin with the sign of a comment: it is the line that has the names that are looked for, or the
-        last one before the rows.
+        A header may begin with the sign of a comment: it is the line that has the names that are
+        looked for, or the last one before the rows.
         """
         start = self._behind_delimiter_line(self.table.skip_rows)
         wanted = set(named)
@@ -233,15 +261,23 @@ class _Parts:
     def _is_header(self, number: int, wanted: set[str]) -> bool:
         if not self.lines[number].strip():
             return False
-        has_names = bool(wanted) and (wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number)))
-        follows = number + 1 < len(self.lines) and self.is_row(number + 1) and not self.is_comment(number + 1)
+        has_names = bool(wanted) and (
+            wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number))
+        )
+        follows = (
+            number + 1 < len(self.lines)
+            and self.is_row(number + 1)
+            and not self.is_comment(number + 1)
+        )
         return has_names or follows
 
     def _without_sign(self, number: int) -> list[str]:
         text = self.lines[number].lstrip()
         for sign in COMMENT_SIGNS:
             text = text.removeprefix(sign)
-        return split_fields(text.strip(), self.table.delimiter) if '"' not in text else []
+        if '"' not in text:
+            return split_fields(text.strip(), self.table.delimiter)
+        return []
 
     def _behind_delimiter_line(self, number: int) -> int:
         """Return the line behind `sep=;`, by which a spreadsheet names the delimiter."""
@@ -255,18 +291,23 @@ class _Parts:
             raise TableUnfit(
                 f"{self.path}:{number + 1}",
                 found=f"`sep={stated}`, which names the delimiter of the file",
-                expected=f"{self.table.delimiter!r}, the `delimiter` under `table` of the import description",
+                expected=f"{self.table.delimiter!r}, the `delimiter` under `table` of the import "
+                "description",
                 remedy=f"write `delimiter: {stated!r}` there",
             )
         return number + 1
 
-    def units_line(self, start: int, names: tuple[str, ...], columns: Sequence[Column]) -> int | None:
+    def units_line(
+        self, start: int, names: tuple[str, ...], columns: Sequence[Column]
+    ) -> int | None:
         """Return the line of units below the header, None without one.
 
         Its fields are no numbers, and at least one of those that are read is a unit.
         """
         number = start
-        while number < len(self.lines) and (not self.lines[number].strip() or self.is_comment(number)):
+        while number < len(self.lines) and (
+            not self.lines[number].strip() or self.is_comment(number)
+        ):
             number += 1
         if not names or number >= len(self.lines):
             return None
@@ -276,7 +317,9 @@ class _Parts:
         read = [fields[index] for index in _indices(columns, names)]
         if any(field.lower() in MISSING for field in read):
             return None
-        return number if any(column_unit_of(field) is not None for field in read) else None
+        if any(column_unit_of(field) is not None for field in read):
+            return number
+        return None
 
     def end(self, start: int) -> int:
         """Return the line behind the last row: empty lines and comments after it are no rows."""
@@ -286,7 +329,8 @@ class _Parts:
         return end
 
     def row_numbers(self, start: int, end: int, *, has_time: bool) -> tuple[list[int], list[str]]:
-        """Return the numbers of the lines that are rows or ought to be, from 0, and remarks on those that are not.
+        """Return the numbers of the lines that are rows or ought to be, from 0,
+        and remarks on those that are not.
 
         Args:
             start, end: first line behind the head, and behind the last row.
@@ -295,22 +339,32 @@ class _Parts:
         while start < end and (not self.lines[start].strip() or self.is_comment(start)):
             start += 1
         sign = self.table.comment
-        comments = [number for number in range(start, end) if sign and self.lines[number].lstrip().startswith(sign)]
+        comments = [
+            number
+            for number in range(start, end)
+            if sign and self.lines[number].lstrip().startswith(sign)
+        ]
         empty = [number for number in range(start, end) if not self.lines[number].strip()]
         remarks = []
         left_out = set(comments)
         if not has_time:
             self._require_no_commented_row(comments)
         if comments:
-            remarks.append(f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows")
-        is_doubled = len(empty) > 1 and all(later - number == 2 for number, later in pairwise(empty))
+            remarks.append(
+                f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows"
+            )
+        is_doubled = len(empty) > 1 and all(
+            later - number == 2 for number, later in pairwise(empty)
+        )
         if empty and (has_time or (is_doubled and 2 * len(empty) + 1 >= end - start)):
             left_out |= set(empty)
             remarks.append(f"left out: {counted(len(empty), 'empty line')} among the rows")
         return [number for number in range(start, end) if number not in left_out], remarks
 
     def _require_no_commented_row(self, comments: Sequence[int]) -> None:
-        """Refuse a row that is commented out: at a stated rate, all that follow would move by a sample."""
+        """Refuse a row that is commented out:
+        at a stated rate, all that follow would move by a sample.
+        """
         sign = self.table.comment or ""
         for number in comments:
             text = self.lines[number].lstrip().removeprefix(sign).strip()
@@ -321,9 +375,11 @@ class _Parts:
             if len(values) > 1 and all(map(math.isfinite, values)):
                 raise TableUnfit(
                     f"{self.path}:{number + 1}",
-                    found=f"{self.shown(number)}, a row of numbers that is commented out, at a rate without stamps",
+                    found=f"{self.shown(number)}, a row of numbers that is commented out, at a "
+                    "rate without stamps",
                     expected="every sample, as `rate_hz` gives each row its time",
-                    remedy="take the sign of the comment away, name a column of stamps by `time`, or import what is "
+                    remedy="take the sign of the comment away, name a column of stamps by `time`, "
+                    "or import what is "
                     "before it and what is behind it by `keep`",
                 )
 
@@ -360,11 +416,15 @@ def _decoded(path: Path, data: bytes) -> tuple[str, ...]:
     bom = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         decoded = (data.decode("utf-16"), "read as UTF-16") if bom else (data.decode("utf-8-sig"),)
-        place, kind = decoded[0].find("\0"), "NUL"
+        place = decoded[0].find("\0")
+        kind = "NUL"
     except UnicodeDecodeError as error:
-        decoded, place, kind = (data.decode("cp1252", "replace"), "no UTF-8; read as Windows-1252"), -1, "no UTF-8"
+        decoded = (data.decode("cp1252", "replace"), "no UTF-8; read as Windows-1252")
+        place = -1
+        kind = "no UTF-8"
         if bom or "\0" in decoded[0] or "\ufffd" in decoded[0]:
-            place, kind = error.start, "no UTF-16" if bom else "no UTF-8"
+            place = error.start
+            kind = "no UTF-16" if bom else "no UTF-8"
     if place >= 0:
         raise TableUnfit(
             str(path),
@@ -376,21 +436,31 @@ def _decoded(path: Path, data: bytes) -> tuple[str, ...]:
 
 
 def _check_header(file: CsvLines, start: int) -> None:
-    """Refuse a header of numbers, the first row of a file without one; columns may be called 0, 1, 2 and so on."""
+    """Refuse a header of numbers, the first row of a file without one;
+    columns may be called 0, 1, 2 and so on.
+    """
     names = file.names
     values = [file.number(name) for name in names]
-    is_counted = len(values) > 1 and values[0] in (0.0, 1.0) and all(b - a == 1.0 for a, b in pairwise(values))
+    is_counted = (
+        len(values) > 1
+        and values[0] in (0.0, 1.0)
+        and all(b - a == 1.0 for a, b in pairwise(values))
+    )
     if values and np.isfinite(values).all() and not is_counted:
         raise TableUnfit(
             f"{file.path}:{start}",
-            found=f"a header of numbers, {', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
+            found="a header of numbers, "
+            f"{', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
             expected="names of columns",
-            remedy="if the file has no header, write `header: false` under `table` and columns as numbers from 1",
+            remedy="if the file has no header, write `header: false` under `table` and columns as "
+            "numbers from 1",
         )
 
 
 def _check_shape(file: CsvLines, named: int) -> None:
-    """Refuse lines that are no rows, rows of another number of fields, and a last row that was cut off."""
+    """Refuse lines that are no rows, rows of another number of fields,
+    and a last row that was cut off.
+    """
     counts = np.array([len(file.fields(row)) for row in file.rows])
     usual = named or Counter(counts.tolist()).most_common(1)[0][0]
     wrong = np.flatnonzero(counts != usual)
@@ -410,12 +480,15 @@ def _check_shape(file: CsvLines, named: int) -> None:
             file.line(last),
             found=f"a last line {file.rows[last][-SHOWN:]!r} of {counts[last]} fields",
             expected=f"{usual} complete fields",
-            remedy=f"the file ends early; export or copy it again, or leave that line out by {_keep_to(file, last)}",
+            remedy="the file ends early; export or copy it again, or leave that line out by "
+            f"{_keep_to(file, last)}",
         )
 
 
 def _require_row(file: CsvLines, row: int) -> None:
-    """Refuse a line without any number: an empty one, a comment, a remark of the program that wrote it."""
+    """Refuse a line without any number: an empty one, a comment,
+    a remark of the program that wrote it.
+    """
     text = file.rows[row]
     is_row = any(math.isfinite(file.number(field)) for field in file.fields(text))
     is_comment = text.lstrip().startswith(COMMENT_SIGNS)
@@ -425,14 +498,21 @@ def _require_row(file: CsvLines, row: int) -> None:
         return
     word = text.split()[0] if text.split() else ""
     sign = next((one for one in COMMENT_SIGNS if word.startswith(one)), word[:4])
-    leave_out = f", or write `comment: {sign!r}` under `table` of the import description" if sign else ""
+    if sign:
+        leave_out = f", or write `comment: {sign!r}` under `table` of the import description"
+    else:
+        leave_out = ""
     empty = "" if sign else "an empty line, "
-    parts = f"`keep: {{to_row: {file.first_row + row}}}`" if row else "`keep`"
+    if row:
+        parts = f"`keep: {{to_row: {file.first_row + row}}}`"
+    else:
+        parts = "`keep`"
     raise TableUnfit(
         file.line(row),
         found=f"{empty}{text[:SHOWN]!r}, a line that is no row of numbers",
         expected="rows of numbers alone, after the header",
-        remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two recordings, import what is "
+        remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two "
+        "recordings, import what is "
         f"before it by {parts}, and what is behind it by `from_row`",
     )
 
@@ -443,17 +523,22 @@ def _keep_to(file: CsvLines, row: int) -> str:
 
 
 def _check_last(file: CsvLines) -> None:
-    """Refuse a last number that may lack digits: one with fewer decimals than all others, or one that jumps."""
+    """Refuse a last number that may lack digits:
+    one with fewer decimals than all others, or one that jumps.
+    """
     ends = [file.fields(row)[-1] for row in file.rows]
     values = np.array([file.number(end) for end in ends])
     decimals = [len(end.partition(file.table.decimal)[2]) for end in ends]
     steps = np.abs(np.diff(values))
     jumps = len(steps) > 1 and steps[-1] > LARGEST_JUMP * steps[:-1].max()
-    if np.isfinite(values[:-1]).all() and (decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])):
+    if np.isfinite(values[:-1]).all() and (
+        decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])
+    ):
         last = len(file.rows) - 1
         raise TableUnfit(
             file.line(last),
             found=f"a last number {ends[-1]!r} without an end of line, after {ends[-2]!r}",
             expected="a number with all its digits",
-            remedy=f"the file ends early: export or copy it again, or leave that line out by {_keep_to(file, last)}",
+            remedy="the file ends early: export or copy it again, or leave that line out by "
+            f"{_keep_to(file, last)}",
         )

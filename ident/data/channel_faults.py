@@ -1,10 +1,12 @@
-"""One judgement of the channels of a recording: what is wrong with single numbers, and whether it can be mended.
+"""One judgement of the channels of a recording:
+what is wrong with single numbers, and whether it can be mended.
 
-Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A stretch in which a
-channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign,
-and an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which too
-much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
-sign `ident.data.unsigned_current`.
+Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A
+stretch in which a channel froze, or stood at the limit of its range, is left out. Of a counter that
+wraps, a number that lost its sign, and an encoder that lost its place, nothing says what is right:
+such a recording is refused, and so is one of which too much is wrong. Held readings are
+`ident.data.held`, currents at a limit `ident.data.clipping`, currents without a sign
+`ident.data.unsigned_current`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from ident.data.held import fill_damaged, held_channel, longest_smooth
 LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
 LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
 LOST_PLACE = 3.0
-"""Least step of a position after which it does not return, in multiples of its largest usual step."""
+"""Least step of a position after which it does not return,
+in multiples of its largest usual step.
+"""
 USUAL_PERCENTILE = 99.0  #: Of the steps of a position
 MOTOR_UNIT = "rad of the motor"
 JOINT_UNIT = "rad or m of the joint"
@@ -56,7 +60,8 @@ class ChannelFault:
     quantity: ChannelKind
     axis: int  #: index
     stretches: IntArray  #: first sample and end of each, shape (s, 2)
-    size: float  #: largest distance from the course, or the range of a counter, in the unit of the channel
+    #: largest distance from the course, or the range of a counter, in the unit of the channel
+    size: float
     samples: int  #: of the recording
     rate_hz: float  #: of the recording
     count: float = 0.0  #: smallest change of the channel
@@ -107,9 +112,10 @@ def find_faults(
         position: of the joints, or of whatever was recorded, shape (k, n).
         current: of the motors, shape (k, n).
         rate_hz: sampling rate.
-        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where each column was
-            recorded as it is.
-        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding. None for all.
+        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where
+            each column was recorded as it is.
+        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding.
+            None for all.
         unit: of the columns of positions, for messages.
 
     Returns:
@@ -118,15 +124,24 @@ def find_faults(
     if len(position) < 2:
         return ()
     found: list[ChannelFault] = []
-    read = position if ratio is None else motor_positions(position, ratio)
+    if ratio is None:
+        read = position
+    else:
+        read = motor_positions(position, ratio)
     for axis, readings in enumerate(_readings(read, rate_hz)):
         others = np.delete(read, axis, axis=1)
-        found += _position_faults(readings, others, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit))
+        found += _position_faults(
+            readings, others, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit)
+        )
     if ratio is not None:
         found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
-        found += _current_faults(readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position)))
-    return tuple(found) if usable is None else faults_in_use(found, usable)
+        found += _current_faults(
+            readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position))
+        )
+    if usable is None:
+        return tuple(found)
+    return faults_in_use(found, usable)
 
 
 def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
@@ -148,7 +163,8 @@ def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[Ch
 
 
 def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
-    """Return what the encoders of the motors have read, shape (k, n): a number that repeats repeats exactly.
+    """Return what the encoders of the motors have read, shape (k, n):
+    a number that repeats repeats exactly.
 
     Args:
         position: of the joints, shape (k, n).
@@ -177,7 +193,8 @@ def _with_joints(
 ) -> list[ChannelFault]:
     """Add the faults of joints that several motors turn, whose own encoders may have been read.
 
-    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are in each of them.
+    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are
+    in each of them.
 
     Args:
         motors: faults of the positions of the motors.
@@ -207,8 +224,8 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
     Args:
         faults: of the recording.
-        displaced: look for positions that go on displaced, of which the limits of the robot may say more; else for
-            all others.
+        displaced: look for positions that go on displaced, of which the limits of the robot may say
+            more; else for all others.
     """
     for one in faults:
         if one.is_refused and (one.kind is FaultKind.DISPLACED) is displaced:
@@ -217,12 +234,15 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
 
 def replaced_samples(
-    faults: Sequence[ChannelFault], quantity: ChannelKind, shape: tuple[int, ...], ratio: FloatArray | None = None
+    faults: Sequence[ChannelFault],
+    quantity: ChannelKind,
+    shape: tuple[int, ...],
+    ratio: FloatArray | None = None,
 ) -> BoolArray:
     """Samples of each column that are to be replaced by those around them, shape (k, n).
 
-    Currents that are left out stay as they are: nothing depends on them. Positions do not, because filters would spread
-    their steps.
+    Currents that are left out stay as they are: nothing depends on them. Positions do not, because
+    filters would spread their steps.
 
     Args:
         faults: of the recording.
@@ -252,7 +272,8 @@ def mended(
     quantity: ChannelKind = ChannelKind.POSITION,
     time: FloatArray | None = None,
 ) -> FloatArray:
-    """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
+    """Return channels, shape (k, n), with the samples replaced that are no readings;
+    the same array without any.
 
     Args:
         values: positions or currents, as of `find_faults`.
@@ -265,15 +286,24 @@ def mended(
     replaced = replaced_samples(faults, quantity, values.shape, ratio)
     if not np.any(replaced):
         return values
-    longest = longest_smooth(rate_hz) if quantity is ChannelKind.POSITION else 0
-    columns = [fill_damaged(own, wrong, longest, time) for own, wrong in zip(values.T, replaced.T, strict=True)]
+    if quantity is ChannelKind.POSITION:
+        longest = longest_smooth(rate_hz)
+    else:
+        longest = 0
+    columns = [
+        fill_damaged(own, wrong, longest, time)
+        for own, wrong in zip(values.T, replaced.T, strict=True)
+    ]
     return np.stack(columns, axis=1)
 
 
-def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int) -> BoolArray:
+def left_out_samples(
+    faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int
+) -> BoolArray:
     """Samples of each axis that are to be left out, shape (k, n).
 
-    Every torque depends on every position. Around a position that is not known, filters spread what is assumed of it.
+    Every torque depends on every position. Around a position that is not known, filters spread what
+    is assumed of it.
 
     Args:
         faults: of the recording.
@@ -301,7 +331,9 @@ class ChannelPlace:
     samples: int  #: of the recording
     unit: str = ""  #: of the channel, for messages
 
-    def fault(self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0) -> ChannelFault:
+    def fault(
+        self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0
+    ) -> ChannelFault:
         """Make a fault of this channel."""
         return ChannelFault(
             kind,
@@ -325,11 +357,16 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
     coarsest = max((count for count in counts if count is not None), default=0.0)
     for values, count in zip(channels.T, counts, strict=True):
         held = held_channel(values, rate_hz)
-        sample = np.arange(len(values)) if held is None else np.flatnonzero(~held)
+        if held is None:
+            sample = np.arange(len(values))
+        else:
+            sample = np.flatnonzero(~held)
         yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
 
 
-def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+def _position_faults(
+    readings: Readings, others: FloatArray, place: ChannelPlace
+) -> Iterator[ChannelFault]:
     """Judge a position, beside those of the other columns, shape (k, n − 1)."""
     jumps = find_jumps(readings, is_position=True)
     whole = wrap_size(readings, jumps, is_position=True)
@@ -347,21 +384,30 @@ def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace
         if len(clipped):
             yield place.fault(FaultKind.CLIPPED, readings, clipped)
     steps = np.abs(np.diff(readings.values))
-    usual = float(np.percentile(steps, USUAL_PERCENTILE)) if len(steps) else 0.0
+    if len(steps):
+        usual = float(np.percentile(steps, USUAL_PERCENTILE))
+    else:
+        usual = 0.0
     lost = np.abs(jumps.step_size) > LOST_PLACE * usual
-    beside = np.isin(readings.sample[jumps.step] + 1, frozen) | np.isin(readings.sample[jumps.step + 1], frozen)
+    beside = np.isin(readings.sample[jumps.step] + 1, frozen) | np.isin(
+        readings.sample[jumps.step + 1], frozen
+    )
     lost &= ~beside
     if np.any(lost):
         size = float(np.max(np.abs(jumps.step_size[lost])))
         yield place.fault(FaultKind.DISPLACED, readings, _steps(readings, jumps.step[lost]), size)
 
 
-def _current_faults(readings: Readings, motor_rad: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+def _current_faults(
+    readings: Readings, motor_rad: FloatArray, place: ChannelPlace
+) -> Iterator[ChannelFault]:
     upper = is_split(readings.values)
     if upper is not None:
         step = np.flatnonzero(np.diff(upper))
         sizes = np.abs(np.diff(readings.values)[step])
-        yield place.fault(FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes)))
+        yield place.fault(
+            FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes))
+        )
         return
     jumps = find_jumps(readings, is_position=False)
     whole = wrap_size(readings, jumps, is_position=False)

@@ -1,8 +1,10 @@
-"""The filters between samples and rows (paper §2.3), chosen once and reported beside every relative error.
+"""The filters between samples and rows (paper §2.3),
+chosen once and reported beside every relative error.
 
-Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column of the equations,
-and the currents, then go through one decimator. Both are written out here: they are twenty lines each, and importing
-scipy.signal for them would take longer than fitting a minute of data. The tests compare both with scipy.signal.
+Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column
+of the equations, and the currents, then go through one decimator. Both are written out here: they
+are twenty lines each, and importing scipy.signal for them would take longer than fitting a minute
+of data. The tests compare both with scipy.signal.
 """
 
 from __future__ import annotations
@@ -18,25 +20,31 @@ from ident.arrays import FloatArray, IntArray
 from ident.errors import ModelError
 
 FULL_FILTER_HZ = 125.0
-"""Sampling rate from which the usual cut-offs hold, that of a real arm in the tests; below, they fall with it."""
+"""Sampling rate from which the usual cut-offs hold, that of a real arm in the tests;
+below, they fall with it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
     """How raw samples become rows."""
 
-    position_cutoff_hz: float = 40.0  #: zero-phase Butterworth on the position, before the central differences
+    #: zero-phase Butterworth on the position, before the central differences
+    position_cutoff_hz: float = 40.0
     position_order: int = 4  #: order of that filter
     #: Of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
     decimation_cutoff_hz: float = 20.0
-    #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty, it is derived from
-    #: each run (`ident.data.dataset.standstill_speed`).
+    #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty,
+    #: it is derived from each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
-    standstill_share: float = 0.1  #: a row is left out when standstill fills more than this share of its filter window
+    #: a row is left out when standstill fills more than this share of its filter window
+    standstill_share: float = 0.1
 
     @classmethod
     def for_rates(cls, rates_hz: Iterable[float]) -> Self:
-        """Return filters for recordings of some sampling rates: the usual ones, lower for slow recordings."""
+        """Return filters for recordings of some sampling rates:
+        the usual ones, lower for slow recordings.
+        """
         share = min((1.0, *(rate_hz / FULL_FILTER_HZ for rate_hz in rates_hz)))
         usual = cls()
         return cls(
@@ -58,7 +66,8 @@ class Conditioning:
             given = ", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing"
             numbers = ", ".join(sorted(expected.keys() - {"standstill_rad_s"}))
             raise ModelError(
-                f"the filter of the calibration: found {given}; expected a list standstill_rad_s and numbers "
+                f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
+                "and numbers "
                 f"{numbers}; give `conditioning`, or fit again"
             )
         order = round(found.pop("position_order"))
@@ -92,15 +101,20 @@ def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -
     return _filtered(sections, forwards[:, ::-1])[:, ::-1][:, pad:-pad]
 
 
-def central_differences(smooth: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, velocity and acceleration of all samples but the first and last; time last, (c, k) → (c, k − 2)."""
+def central_differences(
+    smooth: FloatArray, rate_hz: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, velocity and acceleration of all samples but the first and last;
+    time last, (c, k) → (c, k − 2).
+    """
     position = smooth[:, 1:-1]
     velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate_hz)
     return position, velocity, (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate_hz**2
 
 
 def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Second-order sections (b_0, b_1, b_2), (a_1, a_2) of gain one at rest, by the bilinear transform.
+    """Second-order sections (b_0, b_1, b_2), (a_1, a_2) of gain one at rest,
+    by the bilinear transform.
 
     Args:
         order: N; an odd one ends with a section of first order.
@@ -113,14 +127,18 @@ def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tup
         damping = 2.0 * float(np.sin(np.pi * (2 * pair + 1) / (2 * order))) * w
         scale = 1.0 + damping + w**2
         gain = w**2 / scale
-        sections.append(((gain, 2.0 * gain, gain), (2.0 * (w**2 - 1.0) / scale, (1.0 - damping + w**2) / scale)))
+        sections.append(
+            ((gain, 2.0 * gain, gain), (2.0 * (w**2 - 1.0) / scale, (1.0 - damping + w**2) / scale))
+        )
     if order % 2:
         gain = w / (1.0 + w)
         sections.append(((gain, gain, 0.0), ((w - 1.0) / (1.0 + w), 0.0)))
     return sections
 
 
-def _filtered(sections: list[tuple[tuple[float, ...], tuple[float, ...]]], values: FloatArray) -> FloatArray:
+def _filtered(
+    sections: list[tuple[tuple[float, ...], tuple[float, ...]]], values: FloatArray
+) -> FloatArray:
     """Run the sections over values that were constant before their first sample, shape (c, k)."""
     from scipy.linalg import lapack  # noqa: PLC0415 - a cell file holds filter settings, and reading it needs no LAPACK
 
@@ -139,10 +157,11 @@ def _filtered(sections: list[tuple[tuple[float, ...], tuple[float, ...]]], value
 
 @dataclass(frozen=True, slots=True)
 class Decimator:
-    """A symmetric FIR low-pass that keeps every q-th output: zero phase, and a window of finite length.
+    """A symmetric FIR low-pass that keeps every q-th output:
+    zero phase, and a window of finite length.
 
-    The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of the window" a
-    definite statement.
+    The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of
+    the window" a definite statement.
     """
 
     taps: FloatArray  #: weights, odd number, summing to one
@@ -165,9 +184,10 @@ class Decimator:
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Filter and decimate along the last axis: shape (..., k) → (..., rows(k))."""
         shape = columns.shape
-        count, factor = self.rows(shape[-1]), self.factor
-        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over blocks of samples: one
-        # matrix product that reads every sample once.
+        count = self.rows(shape[-1])
+        factor = self.factor
+        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over
+        # blocks of samples: one matrix product that reads every sample once.
         blocks = -(-len(self.taps) // factor)
         taps = np.zeros(blocks * factor)
         taps[: len(self.taps)] = self.taps
@@ -178,7 +198,9 @@ class Decimator:
             padded[:, : min(length, shape[-1])] = flat[:, :length]
             flat = padded
         # Taps first: the sums below then run along memory.
-        weighted = (taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T).reshape(blocks, len(flat), -1)
+        weighted = (taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T).reshape(
+            blocks, len(flat), -1
+        )
         out = np.zeros((len(flat), count))
         for block, share in enumerate(weighted):
             out += share[:, block : block + count]
@@ -187,8 +209,12 @@ class Decimator:
 
 @lru_cache(maxsize=64)
 def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
-    """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off, transition as wide as the cut-off."""
+    """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off,
+    transition as wide as the cut-off.
+    """
     factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))
     half = round(3.3 * rate_hz / cutoff_hz / 2.0)
-    taps = np.sinc(2.0 * cutoff_hz / rate_hz * np.arange(-half, half + 1)) * np.hamming(2 * half + 1)
+    taps = np.sinc(2.0 * cutoff_hz / rate_hz * np.arange(-half, half + 1)) * np.hamming(
+        2 * half + 1
+    )
     return Decimator(taps / taps.sum(), factor)

@@ -27,7 +27,11 @@ def require_usable(run: str, faults: Sequence[ChannelFault], axes: Sequence[str]
     for fault in faults:
         if fault.is_refused:
             raise ReadingsDamaged(
-                run, (axes[fault.axis],), found=found(fault), expected=expected(fault), remedy=remedy(fault)
+                run,
+                (axes[fault.axis],),
+                found=found(fault),
+                expected=expected(fault),
+                remedy=remedy(fault),
             )
 
 
@@ -40,12 +44,21 @@ def fault_diagnosis(run: str, fault: ChannelFault, axis: str) -> Diagnosis:
         axis: name of the axis.
     """
     name = DAMAGED if fault.is_filled else FROZEN
-    return Diagnosis(name, (run,), (axis,), f"{found(fault)}; {what_is_done(fault)}", expected(fault), remedy(fault))
+    return Diagnosis(
+        name,
+        (run,),
+        (axis,),
+        f"{found(fault)}; {what_is_done(fault)}",
+        expected(fault),
+        remedy(fault),
+    )
 
 
 def what_is_done(fault: ChannelFault) -> str:
     """Say what is done with the samples of a fault."""
-    return "these samples were filled in" if fault.is_filled else "these samples were left out"
+    if fault.is_filled:
+        return "these samples were filled in"
+    return "these samples were left out"
 
 
 def found(fault: ChannelFault) -> str:
@@ -57,9 +70,12 @@ def found(fault: ChannelFault) -> str:
     share = f"in {100.0 * fault.share:.2g} % of the samples"
     match fault.kind:
         case FaultKind.GLITCH:
-            longest_ms = 1e3 * max(end - first for first, end in fault.stretches.tolist()) / fault.rate_hz
+            longest_ms = (
+                1e3 * max(end - first for first, end in fault.stretches.tolist()) / fault.rate_hz
+            )
             return (
-                f"{what} that leaves its course by up to {_sized(fault)} and returns within {longest_ms:.3g} ms, "
+                f"{what} that leaves its course by up to {_sized(fault)} and returns within "
+                f"{longest_ms:.3g} ms, "
                 f"{often}, {share}"
             )
         case FaultKind.FROZEN:
@@ -67,14 +83,21 @@ def found(fault: ChannelFault) -> str:
         case FaultKind.CLIPPED:
             return f"{what} that ends at one number while its motor moves on, {share}, {often}"
         case FaultKind.WRAPPING:
-            return f"{what} that steps by {_sized(fault)} in one sample, {often}: a counter{_bits(fault)} that wraps"
+            return (
+                f"{what} that steps by {_sized(fault)} in one sample, {often}: a "
+                f"counter{_bits(fault)} that wraps"
+            )
         case FaultKind.UNSIGNED:
             return (
-                f"{what} of which one part is {_sized(fault)} above the other, with nothing between: negative numbers"
+                f"{what} of which one part is {_sized(fault)} above the other, with nothing "
+                "between: negative numbers"
                 f"{_bits(fault)} that were read without their sign"
             )
         case FaultKind.DISPLACED:
-            return f"{what} that steps by {_sized(fault)} in one sample, and goes on displaced, {often}"
+            return (
+                f"{what} that steps by {_sized(fault)} in one sample, and goes on "
+                f"displaced, {often}"
+            )
 
 
 def expected(fault: ChannelFault) -> str:
@@ -90,15 +113,23 @@ def remedy(fault: ChannelFault) -> str:
     match fault.kind:
         case FaultKind.WRAPPING if is_position:
             return (
-                "record or export a counter of all turns (of 32 bits), or unwrap the column: nothing in it says in "
+                "record or export a counter of all turns (of 32 bits), or unwrap the column: "
+                "nothing in it says in "
                 "which turn it began"
             )
         case FaultKind.WRAPPING | FaultKind.UNSIGNED:
-            return "read the object or the column as a signed number of enough bits, and record or import again"
+            return (
+                "read the object or the column as a signed number of enough bits, and "
+                "record or "
+                "import again"
+            )
         case FaultKind.CLIPPED:
             return "widen the range of what recorded it, or move within it; record again"
         case _ if is_position:
-            return "check the encoder, its cable, and the object or column of the position; record again"
+            return (
+                "check the encoder, its cable, and the object or column of the position; "
+                "record again"
+            )
         case _:
             return "check the object or column of the current, and what sends it; record again"
 
@@ -108,9 +139,13 @@ def _sized(fault: ChannelFault) -> str:
 
 
 def _bits(fault: ChannelFault) -> str:
-    """Say how many bits a counter has, where its range is a power of two in counts; else nothing."""
+    """Say how many bits a counter has, where its range is a power of two in counts;
+    else nothing.
+    """
     count = 1.0 if fault.unit == COUNTS else fault.count
     if not count > 0.0:
         return ""
     bits = log2(fault.size / count)
-    return f" of {round(bits)} bits" if abs(bits - round(bits)) < NEAR_BITS and bits > 7.0 else ""
+    if abs(bits - round(bits)) < NEAR_BITS and bits > 7.0:
+        return f" of {round(bits)} bits"
+    return ""

@@ -1,10 +1,12 @@
-"""Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
+"""Stretches in which a channel keeps one number although its motor moves:
+an encoder that froze, a limit of a range.
 
-A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only stops from one sample
-to the next is none: a robot may run into something, and a simple device may know no acceleration. One that never goes
-on is frozen where every other stop and turn of its motor was far gentler, and the other motors still move. A position
-at the end of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise
-while its motor moves.
+A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only
+stops from one sample to the next is none: a robot may run into something, and a simple device may
+know no acceleration. One that never goes on is frozen where every other stop and turn of its motor
+was far gentler, and the other motors still move. A position at the end of its range does not jump;
+it stops, and goes on, without any acceleration. A frozen current lacks its noise while its motor
+moves.
 """
 
 from __future__ import annotations
@@ -18,15 +20,17 @@ from ident.data.held import ROUNDING
 LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
 LEAST_CURRENT_S = 0.1  #: Likewise of a current
 ABRUPT = 3.0
-"""Way within BESIDE_S beside a stretch, in multiples of the largest usual change of it from one such time to the next:
-what a motor has on its way to a standstill is half of that."""
+"""Way within BESIDE_S beside a stretch, in multiples of the largest usual change of it from one
+such time to the next: what a motor has on its way to a standstill is half of that.
+"""
 USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
 JUMP = 3.0  #: Jump at the end of a frozen stretch, in multiples of the largest usual step
 STEP_PERCENTILE = 99.0  #: Of the steps of a position: the largest usual one
 BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
-NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
+#: Least share of the changes of a current that turn back: without noise, constant shows nothing
+NOISY = 0.25
 MOVED = 0.02  #: Least way of a motor that moves in a stretch, as a share of its range
 LEAST_TURNS = 2  #: Changes of direction that show how gently a motor slows down
 LATER_S = 0.5  #: Time after a stop in which other motors may still come to rest with it
@@ -39,7 +43,10 @@ def frozen_position(readings: Readings) -> IntArray:
         readings: of a motor's position.
     """
     steps = np.abs(np.diff(readings.values))
-    usual = float(np.percentile(steps, STEP_PERCENTILE)) if len(steps) else 0.0
+    if len(steps):
+        usual = float(np.percentile(steps, STEP_PERCENTILE))
+    else:
+        usual = 0.0
     if not usual > 0.0:
         return _no_stretch()  # nothing says how fast it moves
     least = JUMP * usual + ABRUPT_COUNTS * readings.count
@@ -94,17 +101,22 @@ def _go_on(others: FloatArray, sample: int) -> bool:
 
 
 def clipped_position(readings: Readings) -> IntArray:
-    """Stretches in which a position stands at the largest, or the smallest, value of its range, shape (s, 2).
+    """Stretches in which a position stands at the largest, or the smallest, value of its range,
+    shape (s, 2).
 
     Args:
         readings: of a motor's position.
     """
     stretches = _abrupt(readings)
-    return stretches if at_limit(readings, stretches) else _no_stretch()
+    if at_limit(readings, stretches):
+        return stretches
+    return _no_stretch()
 
 
 def _abrupt(readings: Readings) -> IntArray:
-    """Stretches in which a position is constant and that begin or end without any acceleration, shape (s, 2)."""
+    """Stretches in which a position is constant and that begin or end without any acceleration,
+    shape (s, 2).
+    """
     tiny = ROUNDING * float(np.ptp(readings.values))
     stretches = _constant(readings, tiny, LEAST_S)
     beside = _samples_beside(readings)
@@ -169,7 +181,9 @@ def _samples_beside(readings: Readings) -> int:
 
 
 def _course(readings: Readings) -> FloatArray:
-    """A channel at every sample, from the first to the last reading; a held reading is on the way to the next one."""
+    """A channel at every sample, from the first to the last reading;
+    a held reading is on the way to the next one.
+    """
     samples = np.arange(int(readings.sample[-1]) + 1)
     return np.asarray(np.interp(samples, readings.sample, readings.values))
 
@@ -197,7 +211,10 @@ def _constant(readings: Readings, tiny: float, least_s: float) -> list[tuple[int
 def _samples(readings: Readings, found: list[tuple[int, int]]) -> IntArray:
     if not found:
         return _no_stretch()
-    return np.array([(readings.sample[first], readings.sample[last] + 1) for first, last in found], dtype=np.int64)
+    return np.array(
+        [(readings.sample[first], readings.sample[last] + 1) for first, last in found],
+        dtype=np.int64,
+    )
 
 
 def _no_stretch() -> IntArray:

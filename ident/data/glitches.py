@@ -1,8 +1,10 @@
-"""Samples that leave the course of a channel and return to it, and steps after which it does not return.
+"""Samples that leave the course of a channel and return to it,
+and steps after which it does not return.
 
-A motor does not turn back within a few samples, and its position goes on from where it was. A reading that does neither
-is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a reading of zero where nothing was read. Where
-the channel does not return, the encoder has lost its place, or its counter has wrapped: it goes on, a fixed step aside.
+A motor does not turn back within a few samples, and its position goes on from where it was. A
+reading that does neither is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a
+reading of zero where nothing was read. Where the channel does not return, the encoder has lost its
+place, or its counter has wrapped: it goes on, a fixed step aside.
 
 A step is judged by the steps around it, so speed, noise and counts are those of the moment.
 """
@@ -18,33 +20,49 @@ from ident.data.held import ROUNDING
 
 SUSPECT = 10.0
 """A step is looked at whose change is so many times a percentile of the changes of a channel."""
-POSITION_PERCENTILE, CURRENT_PERCENTILE = 90.0, 98.0
-"""That percentile. A position is smooth at any time. A controller may ask for a current that is one for a sample: where
-a joint breaks loose, those of a real robot have up to 12 times the percentile, and ring on."""
+POSITION_PERCENTILE = 90.0
+CURRENT_PERCENTILE = 98.0
+"""That percentile.
+
+A position is smooth at any time. A controller may ask for a current that is one for a sample: where
+a joint breaks loose, those of a real robot have up to 12 times the percentile, and ring on.
+"""
 JUMP = 10.0
-"""A jump differs from the steps around it by so many times their spread. Noise that is normal reaches 5 times."""
+"""A jump differs from the steps around it by so many times their spread.
+
+Noise that is normal reaches 5 times.
+"""
 SPREAD_PERCENTILE = 80.0
-"""Percentile of the distances of the steps around from their median: a current that goes up and down with friction has
-many small ones beside its large ones; two other glitches may be near."""
+"""Percentile of the distances of the steps around from their median: a current that goes up and
+down with friction has many small ones beside its large ones; two other glitches may be near.
+"""
 JUMP_COUNTS = 20.0  #: And by so many counts: an encoder at rest may flicker
-LEAST_CHANGES = 20  #: Of a channel that shows its counts: those of an axis at rest may be glitches alone
+#: Of a channel that shows its counts: those of an axis at rest may be glitches alone
+LEAST_CHANGES = 20
 NEAR, FAR = 5, 14  #: Steps around a jump that are compared with it, from and to, on either side
 SHORT = 3  #: Readings that a glitch of any shape may have
-LONGEST_S = 0.05  #: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
+#: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
+LONGEST_S = 0.05
 USUAL_PERCENTILES = 1.0, 99.0
-"""Their distance is the usual range of a current. A short glitch of a current is larger: what a controller asks for
-where a joint breaks loose may last one reading, and nothing tells it from a smaller glitch, which bends no gain."""
+"""Their distance is the usual range of a current.
+
+A short glitch of a current is larger: what a controller asks for where a joint breaks loose may
+last one reading, and nothing tells it from a smaller glitch, which bends no gain.
+"""
 RETURN = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
 RETURNED = 2  #: Readings after it that are on the course; what rings on is a blow to the robot
 SAME_SIZE = 0.05  #: Largest relative difference of the steps of a counter that wraps
-EMPTY_FROM, EMPTY_TO = 0.25, 0.75  #: Part of a range that is empty where negative numbers lost their sign
+#: Part of a range that is empty where negative numbers lost their sign
+EMPTY_FROM, EMPTY_TO = 0.25, 0.75
 LEAST_SPLIT = 0.01  #: Least share of the values at either end of it
 WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where it wraps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """The readings of a channel, without samples that repeat the one before because nothing was read."""
+    """The readings of a channel, without samples that repeat the one before because nothing was
+    read.
+    """
 
     values: FloatArray  #: shape (r,)
     sample: IntArray  #: number of the sample of each, increasing, shape (r,)
@@ -53,10 +71,14 @@ class Readings:
 
 
 def smallest_change(values: FloatArray) -> float | None:
-    """Return the smallest change of a channel, shape (k,); None where it changes too seldom to show one."""
+    """Return the smallest change of a channel, shape (k,);
+    None where it changes too seldom to show one.
+    """
     steps = np.abs(np.diff(values))
     changed = steps[steps > ROUNDING * float(np.ptp(values))]
-    return float(changed.min()) if len(changed) >= LEAST_CHANGES else None
+    if len(changed) >= LEAST_CHANGES:
+        return float(changed.min())
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +104,22 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
 
     Args:
         readings: of the channel.
-        is_position: a position is continuous. A current may go up and down within some samples, so a longer glitch
-            of a current repeats one number.
+        is_position: a position is continuous. A current may go up and down within some samples, so
+            a longer glitch of a current repeats one number.
     """
     step, size = _jumps(readings, POSITION_PERCENTILE if is_position else CURRENT_PERCENTILE)
     longest = max(SHORT, round(LONGEST_S * readings.rate_hz))
-    least = 0.0 if is_position else float(np.ptp(np.percentile(readings.values, USUAL_PERCENTILES)))
+    if is_position:
+        least = 0.0
+    else:
+        least = float(np.ptp(np.percentile(readings.values, USUAL_PERCENTILES)))
     glitches: list[Glitch] = []
     left: list[int] = []
     number = 0
     while number < len(step):
-        found = _glitch_from(readings, step[number:], size[number:], longest, least, is_position=is_position)
+        found = _glitch_from(
+            readings, step[number:], size[number:], longest, least, is_position=is_position
+        )
         if found is None:
             left.append(number)
             number += 1
@@ -115,12 +142,17 @@ def wrap_size(readings: Readings, jumps: Jumps, *, is_position: bool) -> float |
     is_same = np.abs(sizes - whole) <= SAME_SIZE * whole
     range_ = float(np.ptp(readings.values))
     is_seen = WRAP_SHARE * whole <= range_ <= (1.0 + SAME_SIZE) * whole
-    place = (readings.values - readings.values.min()) / range_ if range_ > 0.0 else np.zeros(1)
+    if range_ > 0.0:
+        place = (readings.values - readings.values.min()) / range_
+    else:
+        place = np.zeros(1)
     in_middle = float(np.mean((place > EMPTY_FROM) & (place < EMPTY_TO)))
     # A counter goes through its range; a current that friction turns between two values does not.
     is_seen = is_seen and (is_position or in_middle >= LEAST_SPLIT)
     # A single step may be that of an encoder that has lost its place.
-    return whole if is_seen and np.count_nonzero(is_same) >= 2 and np.mean(is_same) > 0.5 else None
+    if is_seen and np.count_nonzero(is_same) >= 2 and np.mean(is_same) > 0.5:
+        return whole
+    return None
 
 
 def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
@@ -132,7 +164,9 @@ def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
-    """Steps unlike those around them, by the number of the reading before, and their sizes less the motion."""
+    """Steps unlike those around them, by the number of the reading before,
+    and their sizes less the motion.
+    """
     nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
     steps = np.diff(readings.values)
     if len(steps) < 2 * FAR:
@@ -160,9 +194,16 @@ def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]
 
 
 def _glitch_from(
-    readings: Readings, step: IntArray, size: FloatArray, longest: int, least: float, *, is_position: bool
+    readings: Readings,
+    step: IntArray,
+    size: FloatArray,
+    longest: int,
+    least: float,
+    *,
+    is_position: bool,
 ) -> tuple[Glitch, int] | None:
-    """Return the glitch that begins with the first of the jumps, and how many of the jumps belong to it.
+    """Return the glitch that begins with the first of the jumps,
+    and how many of the jumps belong to it.
 
     Args:
         readings: of the channel.
@@ -176,7 +217,8 @@ def _glitch_from(
     leaves = float(size[0])
     motion = float(values[begin + 1] - values[begin]) - leaves
     last = len(values) - 1
-    # A current steps where friction turns; one that does so beside an end of the recording need not return.
+    # A current steps where friction turns; one that does so beside an end of the recording need not
+    # return.
     if is_position and begin < SHORT and (len(step) == 1 or step[1] - begin > longest):
         return Glitch(0, begin + 1, abs(leaves)), 1
     for number in range(1, len(step)):
@@ -199,10 +241,12 @@ def _glitch_from(
 
 
 def is_split(values: FloatArray) -> BoolArray | None:
-    """Whether each value is in the upper part of a range whose middle is empty, shape (k,); None where it is not.
+    """Whether each value is in the upper part of a range whose middle is empty, shape (k,);
+    None where it is not.
 
-    A signed number that is read without its sign has its negative values at the other end of the counter's range, and
-    all have one sign: a current that friction alone turns between two values has both.
+    A signed number that is read without its sign has its negative values at the other end of the
+    counter's range, and all have one sign: a current that friction alone turns between two values
+    has both.
     """
     lowest = float(values.min())
     if lowest < 0.0 < float(values.max()):

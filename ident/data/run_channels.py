@@ -1,7 +1,8 @@
-"""Faults of single channels of a run: a joint that never moves, a current that is constant, readings that are none.
+"""Faults of single channels of a run: a joint that never moves, a current that is constant,
+readings that are none.
 
-Each is plain in the channel itself. In the equations of a fit it looks like something else, such as a payload that was
-not mounted, so it is named from the channels before a cause is looked for there.
+Each is plain in the channel itself. In the equations of a fit it looks like something else, such as
+a payload that was not mounted, so it is named from the channels before a cause is looked for there.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ if TYPE_CHECKING:
     from ident.model.model import Model
 
 STILL_RANGE = {JointKind.REVOLUTE: 1e-3, JointKind.PRISMATIC: 1e-4}
-"""Range below which a joint has not moved, whatever its speed [rad or m]: an encoder's last count may flicker."""
-LEAST_MOVING = 0.01  #: Least share of a run in which a joint that moves is above its standstill speed
+"""Range below which a joint has not moved, whatever its speed [rad or m]:
+an encoder's last count may flicker.
+"""
+#: Least share of a run in which a joint that moves is above its standstill speed
+LEAST_MOVING = 0.01
 LEAST_SAMPLES = 20  #: Samples of a moving motor that show a constant current
 
 
@@ -36,16 +40,20 @@ class RunChannels:
     run: str  #: name of the run
     mounting: str | None  #: of the payload; None without load
     still: BoolArray  #: joints that never move, shape (m,)
-    range: FloatArray  #: from the smallest to the largest position of each joint [rad or m], shape (m,)
+    #: from the smallest to the largest position of each joint [rad or m], shape (m,)
+    range: FloatArray
     constant_current: BoolArray  #: motors that move with a current of one value, shape (m,)
     #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
     clipped_percent: FloatArray
     held: HeldChannels | None  #: readings that were held; None where none was
     faults: tuple[ChannelFault, ...]  #: readings that are none (`ident.data.channel_faults`)
-    #: Share of the samples of each moving motor in which its drive gave less than the reference, shape (m,).
+    #: Share of the samples of each moving motor in which its drive gave less than the reference,
+    #: shape (m,).
     limited_percent: FloatArray
-    torque_limits: FloatArray  #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
-    limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
+    #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
+    torque_limits: FloatArray
+    #: largest current of each motor by size, in the unit of the currents, shape (m,)
+    limits: FloatArray
 
 
 def channels_of(model: Model, data: Dataset) -> RunChannels:
@@ -59,9 +67,14 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
     least_range = np.array([STILL_RANGE[kind] for kind in kinds])
     moved = np.ptp(data.position_rad, axis=0)
     still = (moved <= least_range) | (np.mean(data.moving, axis=0) < LEAST_MOVING)
-    clipped = data.clipped if data.clipped is not None else np.zeros_like(data.valid)
+    if data.clipped is not None:
+        clipped = data.clipped
+    else:
+        clipped = np.zeros_like(data.valid)
     usable = data.motor_moving & (data.valid | clipped)
-    percent = 100.0 * np.count_nonzero(clipped, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1)
+    percent = (
+        100.0 * np.count_nonzero(clipped, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1)
+    )
     limits = np.max(np.abs(data.current_a), axis=0, where=usable, initial=0.0)
     is_constant = np.zeros(len(kinds), dtype=np.bool_)
     for motor in range(len(kinds)):
@@ -92,7 +105,9 @@ def require_usable_channels(run: RunChannels, axes: Sequence[str]) -> None:
     require_usable(run.run, run.faults, axes)
     dead = np.flatnonzero(run.constant_current).tolist()
     if dead:
-        raise CurrentConstant(run.run, tuple(axes[axis] for axis in dead), float(run.limits[dead[0]]))
+        raise CurrentConstant(
+            run.run, tuple(axes[axis] for axis in dead), float(run.limits[dead[0]])
+        )
 
 
 def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
@@ -103,17 +118,22 @@ def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
 
 
 def limit_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
-    """Name drives that gave less current than their reference asked for; these samples were left out."""
+    """Name drives that gave less current than their reference asked for;
+    these samples were left out.
+    """
     for run in runs:
         for axis in np.flatnonzero(run.limited_percent > 0.0).tolist():
             yield Diagnosis(
                 "current-limited",
                 (run.run,),
                 (axes[axis],),
-                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque shows at most "
-                f"{run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the samples were left out",
+                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque "
+                "shows at most "
+                f"{run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the samples "
+                "were left out",
                 "a drive that gives the current that its reference asks for",
-                "raise the limit of the current in the drive, or record slower moves or with a lighter payload",
+                "raise the limit of the current in the drive, or record slower moves or with a "
+                "lighter payload",
             )
 
 
@@ -122,10 +142,12 @@ def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
         "current-clipped",
         (run.run,),
         (name,),
-        f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % of the samples; "
+        f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % "
+        "of the samples; "
         "they were left out",
         "a current that follows the torque at every moment",
-        "record slower moves or with a lighter payload, or raise the limit of the current in the drive or in what "
+        "record slower moves or with a lighter payload, or raise the limit of the current in the "
+        "drive or in what "
         "recorded it",
     )
 
@@ -143,12 +165,18 @@ def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
         if run.held is None:
             continue
         if run.held.position_share.any():
-            yield _held_diagnosis(run.run, "positions", axes, run.held.position_share, run.held.position_hold_s)
+            yield _held_diagnosis(
+                run.run, "positions", axes, run.held.position_share, run.held.position_hold_s
+            )
         if run.held.current_share.any():
-            yield _held_diagnosis(run.run, "currents", axes, run.held.current_share, run.held.current_hold_s)
+            yield _held_diagnosis(
+                run.run, "currents", axes, run.held.current_share, run.held.current_hold_s
+            )
 
 
-def _held_diagnosis(run: str, what: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray) -> Diagnosis:
+def _held_diagnosis(
+    run: str, what: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray
+) -> Diagnosis:
     held = np.flatnonzero(share).tolist()
     percent = 100.0 * float(np.max(share))
     typical_ms = 1e3 * float(np.median(hold_s[held]))
@@ -156,16 +184,20 @@ def _held_diagnosis(run: str, what: str, axes: Sequence[str], share: FloatArray,
         "readings-held",
         (run,),
         tuple(axes[axis] for axis in held),
-        f"{what} that repeat the reading before while the robot moves, in up to {percent:.0f} % of the samples, for "
+        f"{what} that repeat the reading before while the robot moves, in up to {percent:.0f} % of "
+        "the samples, for "
         f"some {typical_ms:.3g} ms; what lies between two new readings was filled in",
         "a new reading in every sample",
-        "record at the rate at which the controller answers, or let it answer at the rate of the recording; noise of a "
+        "record at the rate at which the controller answers, or let it answer at the rate of the "
+        "recording; noise of a "
         "current between the readings is lost, and makes the error larger",
     )
 
 
 def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStill | None:
-    """Return the error for a joint that never moves in any run of one mounting, while there are runs of others."""
+    """Return the error for a joint that never moves in any run of one mounting,
+    while there are runs of others.
+    """
     mountings = list(dict.fromkeys(run.mounting for run in runs))
     if len(mountings) < 2:
         return None
@@ -177,7 +209,9 @@ def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStil
     return None
 
 
-def still_joint(runs: Sequence[RunChannels], axes: Sequence[str], consequence: str) -> JointStill | None:
+def still_joint(
+    runs: Sequence[RunChannels], axes: Sequence[str], consequence: str
+) -> JointStill | None:
     """Return the error for runs in which a joint never moves, where the fit contradicts itself.
 
     Args:
@@ -200,7 +234,11 @@ def still_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> tuple[D
         if np.any(run.still):
             names = _still_axes(run.still, axes)
             error = JointStill(run.run, names, _still_text((run,), run.still, axes))
-            found.append(Diagnosis("joint-still", (run.run,), names, error.found, error.expected, error.remedy))
+            found.append(
+                Diagnosis(
+                    "joint-still", (run.run,), names, error.found, error.expected, error.remedy
+                )
+            )
     return tuple(found)
 
 
@@ -215,7 +253,13 @@ def _still_axes(still: BoolArray, axes: Sequence[str]) -> tuple[str, ...]:
 def _still_text(runs: Sequence[RunChannels], still: BoolArray, axes: Sequence[str]) -> str:
     """Say how still the joints are."""
     names = " and ".join(_still_axes(still, axes))
-    verb = "never moves" if np.count_nonzero(still) == 1 else "never move"
+    if np.count_nonzero(still) == 1:
+        verb = "never moves"
+    else:
+        verb = "never move"
     largest = max(float(np.max(run.range[still])) for run in runs)
-    how = "the position is constant" if largest == 0.0 else "no motion is above the standstill speed"
+    if largest == 0.0:
+        how = "the position is constant"
+    else:
+        how = "no motion is above the standstill speed"
     return f"{names} {verb}: {how}"

@@ -1,30 +1,33 @@
-"""Significance of changed gains: one change against its noise, a recalibration as a whole, and the pattern of many.
+"""Significance of changed gains: one change against its noise, a recalibration as a whole,
+and the pattern of many.
 
-Recordings of different days are independent, so σ of a difference is the root of the sum of squares. But σ of a single
-fit covers one session: repeated sessions scatter more (friction warms up, magnets too). Every function here therefore
-takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions` estimates it from a
-history.
+Recordings of different days are independent, so σ of a difference is the root of the sum of
+squares. But σ of a single fit covers one session: repeated sessions scatter more (friction warms
+up, magnets too). Every function here therefore takes a *dispersion*, the ratio of the scatter of
+repeated calibrations to their σ; `dispersions` estimates it from a history.
 
-Control chart of one gain over many calibrations: CUSUM, single points, and the line through all of them.
+Control chart of one gain over many calibrations: CUSUM, single points, and the line through all of
+them.
 
-With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery, Introduction to Statistical
-Quality Control, ch. 9)::
+With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery,
+Introduction to Statistical Quality Control, ch. 9)::
 
     C⁺ᵢ = max(0, C⁺ᵢ₋₁ + zᵢ − k),   C⁻ᵢ = max(0, C⁻ᵢ₋₁ − zᵢ − k),   alarm where either exceeds h
 
-The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while there are fewer, of
-all that came before (Hawkins 1987), so that the zᵢ are independent and the chart watches from the second one on. The
-baseline's own uncertainty is part of the σ of zᵢ.
+The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while
+there are fewer, of all that came before (Hawkins 1987), so that the zᵢ are independent and the
+chart watches from the second one on. The baseline's own uncertainty is part of the σ of zᵢ.
 
-A drift during the first calibrations becomes part of the baseline. The slope of the straight line through all
-calibrations needs no baseline: with gᵢ the gain of calibration i = 1 … n and wᵢ = 1/σᵢ² (weighted least squares; Draper
-& Smith, Applied Regression Analysis, ch. 9)::
+A drift during the first calibrations becomes part of the baseline. The slope of the straight line
+through all calibrations needs no baseline: with gᵢ the gain of calibration i = 1 … n and wᵢ = 1/σᵢ²
+(weighted least squares; Draper & Smith, Applied Regression Analysis, ch. 9)::
 
     t = Σ wᵢ (i − ī) gᵢ / √(Σ wᵢ (i − ī)²),    ī = Σ wᵢ i / Σ wᵢ
 
-is standard normal without drift for every n. Of all tests that do not know the level, |t| is the most powerful against
-a drift from the first calibration to the last. It is worse than the CUSUM at a late change, because all the
-calibrations before it pull at the line too; so neither replaces the other.
+is standard normal without drift for every n. Of all tests that do not know the level, |t| is the
+most powerful against a drift from the first calibration to the last. It is worse than the CUSUM at
+a late change, because all the calibrations before it pull at the line too; so neither replaces the
+other.
 """
 
 from __future__ import annotations
@@ -39,16 +42,25 @@ from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray
 
-LEAST_PROBABILITY = 1e-6  #: That is written with its digits: further out no distribution of errors is known
+#: That is written with its digits: further out no distribution of errors is known
+LEAST_PROBABILITY = 1e-6
 
-DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
+#: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
+DISPERSION = 1.05
 FALSE_ALARM = 0.01
-"""Share of comparisons without any change in which a gain is said to change by more than noise, over all axes."""
+"""Share of comparisons without any change in which a gain is said to change by more than noise,
+over all axes.
+"""
 
-_POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
-"""Weights of the prior and of the pooled estimate beside an axis' own, in numbers of successive differences."""
+_POOLED_WEIGHT = 10.0
+_AXIS_WEIGHT = 30.0
+"""Weights of the prior and of the pooled estimate beside an axis' own,
+in numbers of successive differences.
+"""
 _MIN_DIFFERENCES = 4
-_CUT = 1.5  #: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size
+#: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of
+#: any size
+_CUT = 1.5
 _FARTHEST = 1e100  #: Limit of a difference over its σ, so that its square is still a number
 _MEAN_OF_CUT = (
     1.0
@@ -58,8 +70,11 @@ _MEAN_OF_CUT = (
 """E min(Z², c²) of a standard normal Z."""
 _MEDIAN_OF_NORMAL = 0.6744897501960817  #: Median of |Z|, the upper quartile of a standard normal Z
 _STEPS = 20
-"""Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
-_UNLIKE = 0.01  #: Changes are not one common factor if noise makes them so different in fewer cases than this
+"""Each brings the scale nearer to its end by a factor of two and more,
+unless more than a tenth are outliers.
+"""
+#: Changes are not one common factor if noise makes them so different in fewer cases than this
+_UNLIKE = 0.01
 _COMMON_SIGMAS = 4.0
 
 
@@ -67,7 +82,8 @@ _COMMON_SIGMAS = 4.0
 class Change:
     """Change of one gain."""
 
-    percent: float  #: of the compared gain's magnitude [%], inf from zero; negative where the gain has decreased
+    #: of the compared gain's magnitude [%], inf from zero; negative where the gain has decreased
+    percent: float
     sigmas: float  #: the change over its σ, signed as `percent`
     probability: float  #: of so large a change by noise alone, two-sided
 
@@ -79,7 +95,8 @@ class ChangeDecision:
     differs: bool  #: at least one gain has changed by more than noise
     axes: tuple[str, ...]  #: names, as they were given
     changes: tuple[Change, ...]  #: one an axis
-    #: Probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
+    #: Probability of each axis' change among all of them (Holm 1979, valid however their errors
+    #: depend).
     adjusted: tuple[float, ...]
     significant: tuple[bool, ...]  #: whether each axis' change is more than noise
     words: str  #: the same in one sentence
@@ -109,12 +126,15 @@ def change_significance(
     numbers = np.array([old, old_std, new, new_std, dispersion])
     if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
         raise ValueError(
-            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± {new_std} "
+            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± "
+            f"{new_std} "
             f"and dispersion {dispersion}"
         )
     change = (new - old) * (np.sign(old) or 1.0)
     sigmas = _ratio(float(change), dispersion * math.hypot(old_std, new_std))
-    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, math.erfc(abs(sigmas) / math.sqrt(2.0)))
+    return Change(
+        100.0 * _ratio(float(change), abs(old)), sigmas, math.erfc(abs(sigmas) / math.sqrt(2.0))
+    )
 
 
 def decide(
@@ -130,33 +150,43 @@ def decide(
 
     Of recalibrations without change, one is found in a share of FALSE_ALARM at most.
 
-    Each axis is tested by itself against its own σ, and the probabilities are corrected for the number of axes, however
-    their errors depend on each other. There is no fixed threshold in per cent.
+    Each axis is tested by itself against its own σ, and the probabilities are corrected for the
+    number of axes, however their errors depend on each other. There is no fixed threshold in per
+    cent.
 
     Args:
         axes: n names.
-        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
+        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one
+            unit an axis.
         dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
 
     Raises:
         ValueError: shapes do not fit, a number is not finite, or a σ or a dispersion is negative.
     """
     n = len(axes)
-    columns = [np.broadcast_to(np.asarray(c, float), (n,)) for c in (old, old_std, new, new_std, dispersion)]
+    columns = [
+        np.broadcast_to(np.asarray(c, float), (n,))
+        for c in (old, old_std, new, new_std, dispersion)
+    ]
     changes = tuple(
-        change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
+        change_significance(*map(float, four), dispersion=float(factor))
+        for *four, factor in zip(*columns, strict=True)
     )
-    # Holm: the smallest probability counts times their number, the next times one less, never falling.
+    # Holm: the smallest probability counts times their number, the next times one less, never
+    # falling.
     probabilities = np.array([change.probability for change in changes])
     order = np.argsort(probabilities)
     adjusted = np.empty(n)
-    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
+    adjusted[order] = np.maximum.accumulate(
+        np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1))
+    )
     significant = tuple(bool(probability <= FALSE_ALARM) for probability in adjusted)
     differs = any(significant)
     words = "no gain to compare"
     if axes:
         parts = [
-            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, {_probability(p)} among {n})"
+            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, {_probability(p)} "
+            f"among {n})"
             for axis, change, p in zip(axes, changes, adjusted, strict=True)
         ]
         largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
@@ -167,11 +197,13 @@ def decide(
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
-    """Estimate how much more repeated calibrations scatter than their σ, for each axis; never less than 1.
+    """Estimate how much more repeated calibrations scatter than their σ, for each axis;
+    never less than 1.
 
-    From differences of successive calibrations, so that a slow drift adds little; each counts up to 1.5 of their σ
-    (Huber 1964, proposal 2), so that a sudden change adds little too. The estimate of an axis is drawn towards that of
-    all axes, and that towards DISPERSION, by weights in numbers of differences (as a scaled inverse-χ² prior).
+    From differences of successive calibrations, so that a slow drift adds little; each counts up to
+    1.5 of their σ (Huber 1964, proposal 2), so that a sudden change adds little too. The estimate
+    of an axis is drawn towards that of all axes, and that towards DISPERSION, by weights in numbers
+    of differences (as a scaled inverse-χ² prior).
 
     Args:
         values, stds: shape (..., axes, n), oldest first; leading dimensions are separate histories.
@@ -179,7 +211,8 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     Returns:
         shape (..., axes).
     """
-    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    values = np.asarray(values, float)
+    stds = np.asarray(stds, float)
     count = values.shape[-1] - 1
     if count < _MIN_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
@@ -198,14 +231,16 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
 def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
     """Classify the changes of all gains together.
 
-    They have one common factor where at least two raise an alarm, the weighted mean c̄ of all changes is significant,
-    and Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom makes plausible.
+    They have one common factor where at least two raise an alarm, the weighted mean c̄ of all
+    changes is significant, and Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom
+    makes plausible.
 
     Args:
         change_percent, std_percent: of each axis since its baseline, with σ > 0 [%], shape (n,).
         alarmed: which of them raise an alarm, shape (n,).
     """
-    changes, stds = np.asarray(change_percent, float), np.asarray(std_percent, float)
+    changes = np.asarray(change_percent, float)
+    stds = np.asarray(std_percent, float)
     count = int(np.count_nonzero(alarmed))
     if count < 2:
         return Pattern.ONE if count else Pattern.NONE
@@ -215,11 +250,15 @@ def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLik
     common = float(weights @ changes / weights.sum())
     spread = float(weights @ (changes - common) ** 2)
     alike = chdtrc(len(changes) - 1, spread) > _UNLIKE
-    return Pattern.COMMON if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS else Pattern.SEVERAL
+    if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS:
+        return Pattern.COMMON
+    return Pattern.SEVERAL
 
 
 def _robust_variance(squares: FloatArray) -> FloatArray:
-    """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis, starting from the median."""
+    """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis,
+    starting from the median.
+    """
     found = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
     for _ in range(_STEPS):
         found = np.minimum(squares, _CUT**2 * found[..., None]).mean(axis=-1) / _MEAN_OF_CUT
@@ -235,7 +274,9 @@ def _ratio(part: float, whole: float) -> float:
 
 def _probability(p: float) -> str:
     """A probability in words; far in the tail of a distribution its digits mean nothing."""
-    return f"p < {LEAST_PROBABILITY:.0e}".replace("e-0", "e-") if p < LEAST_PROBABILITY else f"p = {p:.2g}"
+    if p < LEAST_PROBABILITY:
+        return f"p < {LEAST_PROBABILITY:.0e}".replace("e-0", "e-")
+    return f"p = {p:.2g}"
 
 
 def _short(sigmas: float) -> str:
@@ -243,15 +284,22 @@ def _short(sigmas: float) -> str:
     return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"
 
 
-FEWEST = 4  #: Calibrations of the first line that is tested; through fewer it is hardly more than one difference
-_RECENT = 3  #: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent
+#: Calibrations of the first line that is tested; through fewer it is hardly more than one
+#: difference
+FEWEST = 4
+#: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be
+#: recent
+_RECENT = 3
 _FINEST = 2.0**-52  #: Smallest σ of the largest gain over itself: no number is written finer
-_APART = 1e3  #: Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway
+#: Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway
+_APART = 1e3
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Limits of the chart; the defaults come from `make drift-study`, docs/evidence/drift.md has its table."""
+    """Limits of the chart; the defaults come from `make drift-study`,
+    docs/evidence/drift.md has its table.
+    """
 
     reference: float = 1.25  #: k [σ]: half the shift that is to be found soonest
     threshold: float = 4.6  #: h [σ]: sum that raises an alarm
@@ -284,23 +332,26 @@ class Alarm:
 class Drift:
     """Change of one gain since its baseline began."""
 
-    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to the onset while there
-    #: is an alarm; while that is a trend, the beginning of the line.
+    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to
+    #: the onset while there is an alarm; while that is a trend, the beginning of the line.
     baseline: float
     baseline_std: float  #: its σ
     #: Z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
     deviations: FloatArray
     upper: FloatArray  #: C⁺, shape (n,)
     lower: FloatArray  #: C⁻, shape (n,)
-    #: T of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
+    #: T of the line through each calibration and all before it, shape (n,), positive where the
+    #: magnitude rises.
     trend: FloatArray
-    #: In the order of the calibrations, also those that have passed; nothing else here depends on these.
+    #: In the order of the calibrations, also those that have passed; nothing else here depends on
+    #: these.
     alarms: tuple[Alarm, ...]
-    #: Index of the last calibration before the change that `alarm` reports, the first calibration for a trend; None
-    #: where the newest calibration raises no alarm.
+    #: Index of the last calibration before the change that `alarm` reports, the first calibration
+    #: for a trend; None where the newest calibration raises no alarm.
     onset: int | None
-    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without alarm those behind
-    #: the baseline, if fewer); while there is a trend, along the line [% of the baseline's magnitude].
+    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without
+    #: alarm those behind the baseline, if fewer); while there is a trend, along the line [% of the
+    #: baseline's magnitude].
     change_percent: float
     change_sigmas: float  #: the same over its σ
 
@@ -324,27 +375,36 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
     """Watch one gain.
 
     Args:
-        values, stds: of its calibrations since the last acknowledged change, oldest first, shape (n,), n ≥ 1, in one
-            unit; σ > 0.
-        dispersion: scatter of repeated calibrations over their σ, as `ident.drift.change.dispersions` finds it.
+        values, stds: of its calibrations since the last acknowledged change, oldest first, shape
+            (n,), n ≥ 1, in one unit; σ > 0.
+        dispersion: scatter of repeated calibrations over their σ, as
+            `ident.drift.change.dispersions` finds it.
 
     Raises:
-        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline is zero.
+        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline
+            is zero.
     """
-    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    values = np.asarray(values, float)
+    stds = np.asarray(stds, float)
     if values.ndim != 1 or values.shape != stds.shape or not len(values):
-        raise ValueError(f"expected as many values as σ, at least one, found shapes {values.shape} and {stds.shape}")
+        raise ValueError(
+            f"expected as many values as σ, at least one, found shapes {values.shape} "
+            f"and {stds.shape}"
+        )
     if not (np.isfinite(values).all() and np.isfinite(stds).all() and (stds > 0).all()):
         raise ValueError("expected finite gains with σ > 0")
     scale = float(np.abs(values).max())
     if scale == 0:
         raise ValueError("expected gains other than zero")
-    values, stds = values / scale, _bounded(stds, scale)
+    values = values / scale
+    stds = _bounded(stds, scale)
     sign = 1.0 if values.sum() > 0 else -1.0
     deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, CHART)
     slopes = trend_statistic(sign * values, stds, dispersion)
     found: list[Alarm] = []
-    for index, (z, above, below, slope) in enumerate(zip(deviations, upper, lower, slopes, strict=True)):
+    for index, (z, above, below, slope) in enumerate(
+        zip(deviations, upper, lower, slopes, strict=True)
+    ):
         if max(above, below) > CHART.threshold:
             found.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
         elif abs(z) > CHART.single:
@@ -356,12 +416,18 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
     present = _present(alarms, len(values))
     onset = None if present is None else 0
     if present is not None and present.kind is not AlarmKind.TREND:
-        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change point).
-        onset = int(np.flatnonzero((upper if present.rose else lower)[: present.index + 1] == 0.0)[-1])
+        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change
+        # point).
+        onset = int(
+            np.flatnonzero((upper if present.rose else lower)[: present.index + 1] == 0.0)[-1]
+        )
     if present is not None and present.kind is AlarmKind.TREND:
-        line, steps = fit_line(values, stds), len(values) - 1
-        baseline, baseline_std = line.start, line.start_std
-        change, change_std = steps * line.slope, steps * line.slope_std
+        line = fit_line(values, stds)
+        steps = len(values) - 1
+        baseline = line.start
+        baseline_std = line.start_std
+        change = steps * line.slope
+        change_std = steps * line.slope_std
     else:
         # The baseline ends at the onset, and the newest calibrations begin behind both.
         first = max(1, min(len(values) - 1 if onset is None else onset + 1, CHART.baseline))
@@ -399,8 +465,11 @@ def cusum_paths(
     """
     weights = np.cumsum(1.0 / stds**2, axis=-1)
     means = np.cumsum(values / stds**2, axis=-1) / weights
-    shape, n = values.shape, values.shape[-1]
-    deviations, upper, lower = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    shape = values.shape
+    n = values.shape[-1]
+    deviations = np.zeros(shape)
+    upper = np.zeros(shape)
+    lower = np.zeros(shape)
     for i in range(1, n):
         last = min(i, chart.baseline) - 1
         std = dispersion * np.sqrt(stds[..., i] ** 2 + 1.0 / weights[..., last])
@@ -410,8 +479,11 @@ def cusum_paths(
     return deviations, upper, lower
 
 
-def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray | float) -> FloatArray:
-    """Compute t of the line through the first n calibrations, for every n and any number of gains at once.
+def trend_statistic(
+    values: FloatArray, stds: FloatArray, dispersion: FloatArray | float
+) -> FloatArray:
+    """Compute t of the line through the first n calibrations,
+    for every n and any number of gains at once.
 
     Args:
         values, stds: magnitudes, shape (..., n), oldest first, σ > 0.
@@ -422,7 +494,8 @@ def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray
     """
     found = np.zeros(values.shape)
     total, middle, mean, spread, product = (np.zeros(values.shape[:-1]) for _ in range(5))
-    # About running means (West 1979): differences of large sums lose their digits where one σ is far below the others.
+    # About running means (West 1979): differences of large sums lose their digits where one σ is
+    # far below the others.
     for i in range(values.shape[-1]):
         weight = 1.0 / stds[..., i] ** 2
         total = total + weight
@@ -451,7 +524,8 @@ def fit_line(values: FloatArray, stds: FloatArray) -> GainTrend:
     weights = 1.0 / stds**2
     total = float(weights.sum())
     places = np.arange(len(values))
-    middle, mean = float(weights @ places) / total, float(weights @ values) / total
+    middle = float(weights @ places) / total
+    mean = float(weights @ values) / total
     spread = float(weights @ (places - middle) ** 2)
     slope = float(weights @ ((places - middle) * (values - mean))) / spread
     start_std = math.sqrt(1.0 / total + middle**2 / spread)
@@ -459,7 +533,9 @@ def fit_line(values: FloatArray, stds: FloatArray) -> GainTrend:
 
 
 def _bounded(stds: FloatArray, scale: float) -> FloatArray:
-    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes, or leaves nothing of the others."""
+    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes,
+    or leaves nothing of the others.
+    """
     with np.errstate(over="ignore"):
         relative = np.clip(stds / scale, _FINEST, 1.0 / _FINEST)
     middle = float(np.median(relative))
@@ -475,4 +551,6 @@ def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
 
 def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:
     """Alarm of the newest of `count` calibrations."""
-    return alarms[-1] if alarms and alarms[-1].index == count - 1 else None
+    if alarms and alarms[-1].index == count - 1:
+        return alarms[-1]
+    return None

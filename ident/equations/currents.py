@@ -1,22 +1,24 @@
-"""The equations of the motors' currents, whitened: what maximum likelihood, weighing and error bars stand on.
+"""The equations of the motors' currents, whitened:
+what maximum likelihood, weighing and error bars stand on.
 
-The errors are those of the currents, e_i ~ (0, σ_i²). With D = diag(g_i σ_i), and τ the torque that links, friction and
-payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T (DriveTrain.to_motor),
+The errors are those of the currents, e_i ~ (0, σ_i²). With D = diag(g_i σ_i), and τ the torque that
+links, friction and payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T
+(DriveTrain.to_motor),
 
     e = T_D (V g − τ),    V = diag(v),    T_D = D⁻¹.
 
 Each motor has an equation of its own then, and a triangle of its rows says all (`Currents`).
 
-A redundantly driven robot has more motors than degrees of freedom: motors can work against each other. This internal
-preload λ moves nothing and is not known, V g = τ + N λ with N the null space of Aᵀ (`ident.model.closed_chain`). The
-most likely λ of each sample, for given g and σ, leaves
+A redundantly driven robot has more motors than degrees of freedom: motors can work against each
+other. This internal preload λ moves nothing and is not known, V g = τ + N λ with N the null space
+of Aᵀ (`ident.model.closed_chain`). The most likely λ of each sample, for given g and σ, leaves
 
     e = T_D (V g − τ),    T_D = P D⁻¹,    P = 1 − D⁻¹N (NᵀD⁻²N)⁻¹ NᵀD⁻¹,
 
-whose entries are the corrections of the currents in units of their σ: a total least squares, as before. P changes from
-sample to sample, so the rows are kept (`PreloadedCurrents`). The columns of g are those of corrected currents: with
-measured ones their noise would make the gains smaller (errors in variables; Golub & Van Loan, SIAM J. Numer. Anal. 17
-(1980)).
+whose entries are the corrections of the currents in units of their σ: a total least squares, as
+before. P changes from sample to sample, so the rows are kept (`PreloadedCurrents`). The columns of
+g are those of corrected currents: with measured ones their noise would make the gains smaller
+(errors in variables; Golub & Van Loan, SIAM J. Numer. Anal. 17 (1980)).
 """
 
 from __future__ import annotations
@@ -35,10 +37,11 @@ LONG = 20  #: So many rows a column are reduced to a triangle first
 
 @dataclass(frozen=True, slots=True)
 class Currents:
-    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other; each row holds the current of its motor alone.
+    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other;
+    each row holds the current of its motor alone.
 
-    Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the likelihood, as P is a
-    projection.
+    Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the
+    likelihood, as P is a projection.
     """
 
     drive: FloatArray  #: V, per unit of each gain, shape (k, m)
@@ -50,7 +53,9 @@ class Currents:
     @classmethod
     def of_motors(cls, triangles: Triangles) -> Currents:
         """Take apart the motors' rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i]."""
-        motor = np.repeat(np.arange(len(triangles.factors)), [len(factor) for factor in triangles.factors])
+        motor = np.repeat(
+            np.arange(len(triangles.factors)), [len(factor) for factor in triangles.factors]
+        )
         stacked = np.concatenate(triangles.factors)
         drive = np.zeros((len(stacked), len(triangles.factors)))
         drive[np.arange(len(stacked)), motor] = stacked[:, 0]
@@ -80,23 +85,31 @@ class Currents:
         linear = self.linear / unit[:, None]
         return Currents(drive, linear, self.known / unit, self.motor, self.rows)
 
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
-        """Drive columns with the corrected currents, shape (k, m): the derivative of e to each gain."""
+    def corrected(
+        self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
+    ) -> FloatArray:
+        """Drive columns with the corrected currents, shape (k, m):
+        the derivative of e to each gain.
+        """
         del noise
         corrected = whitened.drive.copy()
         corrected[np.arange(len(residual)), self.motor] -= residual / gains[self.motor]
         return corrected
 
     def noise(
-        self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
+        self,
+        gains: FloatArray,
+        parameters: FloatArray,
+        free: int = 0,
+        before: FloatArray | None = None,
     ) -> FloatArray:
         """σ of each current [A] around an estimate, shape (m,); 1 for a motor without rows.
 
         Args:
             gains, parameters: of the estimate.
             free: number of estimated parameters, which are shared among the motors.
-            before: σ so far, for one round; None for as many rounds as it takes. The root mean square of v − τ/g needs
-                none.
+            before: σ so far, for one round; None for as many rounds as it takes. The root mean
+                square of v − τ/g needs none.
         """
         del before
         current_a = self.residual(gains, parameters) / gains[self.motor]
@@ -105,13 +118,17 @@ class Currents:
         return np.asarray(np.sqrt(square_sum / np.maximum(self.rows - free / len(gains), 1.0)))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum; with preload for this σ."""
+        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum;
+        with preload for this σ.
+        """
         del noise
         size = self.noise(gains, parameters) * np.sqrt(np.maximum(self.rows, 1.0))
         return float(self.rows @ np.log(size))
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-        """χ and σ of each current [A] for given gains, shapes (p,) and (m,): a fixed point of a few rounds."""
+        """χ and σ of each current [A] for given gains, shapes (p,) and (m,):
+        a fixed point of a few rounds.
+        """
         even = np.ones(len(gains))
         noise = self.noise(gains, self.whitened(gains, even).parameters(gains), free, even)
         for _ in range(ROUNDS):
@@ -125,7 +142,9 @@ class Currents:
 
 @dataclass(frozen=True, slots=True)
 class PreloadedCurrents(Currents):
-    """Motors that can work against each other: as many rows a motor, r, each with the currents of all."""
+    """Motors that can work against each other:
+    as many rows a motor, r, each with the currents of all.
+    """
 
     preload: FloatArray  #: N of each row of a motor, orthonormal, shape (r, m, m − d)
 
@@ -141,7 +160,9 @@ class PreloadedCurrents(Currents):
         stacked = np.concatenate(rows)
         motor = np.repeat(np.arange(count), len(preload))
         equations = np.full(count, len(preload))
-        return cls(stacked[:, :count], stacked[:, count:-1], stacked[:, -1], motor, equations, preload)
+        return cls(
+            stacked[:, :count], stacked[:, count:-1], stacked[:, -1], motor, equations, preload
+        )
 
     def transform(self, gains: FloatArray, noise: FloatArray) -> FloatArray:
         """T_D of each row, shape (r, m, m)."""
@@ -166,7 +187,9 @@ class PreloadedCurrents(Currents):
             self.rows,
         )
 
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
+    def corrected(
+        self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
+    ) -> FloatArray:
         """Take the corrections σ e out of the measured currents."""
         corrections = noise[:, None] * residual.reshape(len(gains), -1)
         # (T_D)_rij c_jr: what the correction of motor j changes in the row of motor i
@@ -174,12 +197,17 @@ class PreloadedCurrents(Currents):
         return np.asarray(whitened.drive - change.reshape(whitened.drive.shape))
 
     def noise(
-        self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
+        self,
+        gains: FloatArray,
+        parameters: FloatArray,
+        free: int = 0,
+        before: FloatArray | None = None,
     ) -> FloatArray:
-        """σ of each current from its corrections, and from the share of its noise that they show, P_ii.
+        """σ of each current from its corrections, and from the share of its noise that they show,
+        P_ii.
 
-        The corrections of a motor hold only what the preload has left of its noise (variance components: Förstner,
-        Allgemeine Vermessungs-Nachrichten 86 (1979)).
+        The corrections of a motor hold only what the preload has left of its noise (variance
+        components: Förstner, Allgemeine Vermessungs-Nachrichten 86 (1979)).
         """
         if before is None:
             noise = np.ones(len(gains))
@@ -192,7 +220,9 @@ class PreloadedCurrents(Currents):
         residual = self.whitened(gains, before).residual(gains, parameters).reshape(len(gains), -1)
         visible = np.einsum("rii->i", self.transform(gains, before) * (gains * before))
         square_sum = np.sum(residual**2, axis=1)
-        return np.asarray(before * np.sqrt(square_sum / np.maximum(visible - free / len(gains), 1.0)))
+        return np.asarray(
+            before * np.sqrt(square_sum / np.maximum(visible - free / len(gains), 1.0))
+        )
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
         """½ ‖e‖², for this σ."""

@@ -1,9 +1,10 @@
 """The problem around an estimate as a linear one, and everything that leaves moves out of it.
 
 The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_m, χ, χ_uL); see
-estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
-current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
-time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut_into_folds`).
+estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not
+from the measured current, so that the noise does not enter it. `motor_jacobian` is that derivative.
+Error bars leave out one move at a time (`left_out_shifts`); the search for effects leaves out folds
+of moves (`cut_into_folds`).
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
 RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it: two effects may be nearly equal
-CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
+#: Standard errors of the correlation of neighbouring clusters, above which they are joined
+CORRELATED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Jacobian:
-    """A matrix with the rows of all motors below each other, of which each holds the unknowns of its motor alone.
+    """A matrix with the rows of all motors below each other,
+    of which each holds the unknowns of its motor alone.
 
-    The equation of a motor near the flange has few of them: less than half of the numbers of the whole matrix are kept.
+    The equation of a motor near the flange has few of them: less than half of the numbers of the
+    whole matrix are kept.
     """
 
     parts: tuple[FloatArray, ...]  #: of each motor's rows, columns first, shapes (s_i, rows_i)
@@ -43,7 +47,9 @@ class Jacobian:
 
     def __matmul__(self, step: FloatArray) -> FloatArray:
         """J x, shape (rows,), from x, shape (f,)."""
-        return np.concatenate([step[seen] @ part for part, seen in zip(self.parts, self.seen, strict=True)])
+        return np.concatenate(
+            [step[seen] @ part for part, seen in zip(self.parts, self.seen, strict=True)]
+        )
 
     def columns(self, chosen: IntArray) -> FloatArray:
         """Some of its columns, shape (rows, k)."""
@@ -59,7 +65,10 @@ class Jacobian:
         kept = [np.isin(seen, chosen) for seen in self.seen]
         return Jacobian(
             tuple(part[keep] for part, keep in zip(self.parts, kept, strict=True)),
-            tuple(np.searchsorted(chosen, seen[keep]) for seen, keep in zip(self.seen, kept, strict=True)),
+            tuple(
+                np.searchsorted(chosen, seen[keep])
+                for seen, keep in zip(self.seen, kept, strict=True)
+            ),
             len(chosen),
         )
 
@@ -67,7 +76,9 @@ class Jacobian:
         """JᵀΦ, shape (f, …), from columns on all rows, shape (rows, …)."""
         out = np.zeros((self.width, *columns.shape[1:]))
         ends = np.cumsum([part.shape[1] for part in self.parts])
-        for part, seen, own in zip(self.parts, self.seen, np.split(columns, ends[:-1]), strict=True):
+        for part, seen, own in zip(
+            self.parts, self.seen, np.split(columns, ends[:-1]), strict=True
+        ):
             out[seen] += part @ own
         return out
 
@@ -93,11 +104,14 @@ class Linearisation:
     gamma: FloatArray  #: 1/g, shape (m,)
     noise: FloatArray  #: σ_i [A], shape (m,)
     free: IntArray  #: which of (gains, parameters) are free, shape (f,)
-    #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
+    #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one,
+    #: shape (f,).
     scale: FloatArray
-    #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None where it is D⁻¹.
+    #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None
+    #: where it is D⁻¹.
     transform: FloatArray | None = None
-    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where there are none.
+    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where
+    #: there are none.
     scatter: RunScatter | None = None
 
     @property
@@ -106,7 +120,9 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def of_clusters(self, per_row: IntArray) -> IntArray:
-        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that clusters do not part."""
+        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that
+        clusters do not part.
+        """
         return per_row[self.source[np.unique(self.cluster, return_index=True)[1]]]
 
     def rows_of(self, motor: int) -> slice:
@@ -115,7 +131,9 @@ class Linearisation:
         return slice(int(first), int(last))
 
     def shown(self, motor: int) -> float:
-        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the current's noise."""
+        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the
+        current's noise.
+        """
         rows = self.rows_of(motor)
         if self.transform is None:
             return float(rows.stop - rows.start)
@@ -123,7 +141,8 @@ class Linearisation:
         return float(passed.sum() * self.noise[motor] / self.gamma[motor])
 
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Joint torque columns, shape (m, extra, r), whitened, on the rows of each motor that feels any: (extra, rows).
+        """Joint torque columns, shape (m, extra, r), whitened,
+        on the rows of each motor that feels any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
@@ -131,7 +150,9 @@ class Linearisation:
         """
         return self.decorrelated_by_motor([self.whitened_by_motor(torque_nm, to_motor)])[0]
 
-    def whitened_by_motor(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
+    def whitened_by_motor(
+        self, torque_nm: FloatArray, to_motor: FloatArray
+    ) -> dict[int, FloatArray]:
         """The same with what runs share still in the columns; see `decorrelated_by_motor`."""
         felt: dict[int, FloatArray] = {}
         if self.transform is not None:
@@ -147,11 +168,15 @@ class Linearisation:
                 felt[motor] = felt[motor] + own if motor in felt else own
         return felt
 
-    def decorrelated_by_motor(self, each: Sequence[dict[int, FloatArray]]) -> list[dict[int, FloatArray]]:
-        """Take out of whitened columns what the rows of a run share; all together, because that is faster.
+    def decorrelated_by_motor(
+        self, each: Sequence[dict[int, FloatArray]]
+    ) -> list[dict[int, FloatArray]]:
+        """Take out of whitened columns what the rows of a run share;
+        all together, because that is faster.
 
         Args:
-            each: columns on the rows of each motor that feels any, of some candidates, shapes (extra, rows).
+            each: columns on the rows of each motor that feels any, of some candidates, shapes
+                (extra, rows).
         """
         if self.scatter is None:
             return list(each)
@@ -167,8 +192,11 @@ class Linearisation:
                 found[number][motor] = part
         return found
 
-    def beside_scatter(self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray) -> Linearisation:
-        """The same problem where the rows of a run share errors, decorrelated from these; the unknowns stay.
+    def beside_scatter(
+        self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray
+    ) -> Linearisation:
+        """The same problem where the rows of a run share errors, decorrelated from these;
+        the unknowns stay.
 
         Args:
             torque_nm: of one standard deviation of each error, shape (m, k, r).
@@ -178,35 +206,53 @@ class Linearisation:
         motors = range(len(self.gamma))
         whole = self.whitened(torque_nm, to_motor).T
         rows = [self.rows_of(motor) for motor in motors]
-        scatter = RunScatter.of([whole[:, own] for own in rows], [run[self.source[own]] for own in rows])
+        scatter = RunScatter.of(
+            [whole[:, own] for own in rows], [run[self.source[own]] for own in rows]
+        )
         parts = tuple(scatter.decorrelate(motor, self.jacobian.parts[motor]) for motor in motors)
-        residual = [scatter.decorrelate(motor, self.residual[None, own])[0] for motor, own in enumerate(rows)]
+        residual = [
+            scatter.decorrelate(motor, self.residual[None, own])[0]
+            for motor, own in enumerate(rows)
+        ]
         return replace(
-            self, jacobian=replace(self.jacobian, parts=parts), residual=np.concatenate(residual), scatter=scatter
+            self,
+            jacobian=replace(self.jacobian, parts=parts),
+            residual=np.concatenate(residual),
+            scatter=scatter,
         )
 
     def fitted(self) -> tuple[Linearisation, FloatArray]:
-        """The same around the best fit of its rows, and the step to it, shape (f,), in the scale of the unknowns."""
+        """The same around the best fit of its rows, and the step to it, shape (f,),
+        in the scale of the unknowns.
+        """
         hessian = sum_of_squares(self.jacobian)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
-        step = linalg.cho_solve(linalg.cho_factor(hessian, lower=True), self.jacobian.on_columns(self.residual))
+        step = linalg.cho_solve(
+            linalg.cho_factor(hessian, lower=True), self.jacobian.on_columns(self.residual)
+        )
         return replace(self, residual=self.residual - self.jacobian @ step), step
 
     def decorrelated(self, columns: FloatArray) -> FloatArray:
-        """V^(−1/2) times columns, shape (rows,); the columns themselves where runs share no errors."""
+        """V^(−1/2) times columns, shape (rows,);
+        the columns themselves where runs share no errors.
+        """
         if self.scatter is None:
             return columns
         parts = [
-            self.scatter.decorrelate(motor, columns[None, self.rows_of(motor)])[0] for motor in range(len(self.gamma))
+            self.scatter.decorrelate(motor, columns[None, self.rows_of(motor)])[0]
+            for motor in range(len(self.gamma))
         ]
         return np.concatenate(parts)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
-        """V times decorrelated columns, shape (rows,); the columns themselves where runs share no errors."""
+        """V times decorrelated columns, shape (rows,);
+        the columns themselves where runs share no errors.
+        """
         if self.scatter is None:
             return columns
         parts = [
-            self.scatter.correlate(motor, columns[None, self.rows_of(motor)])[0] for motor in range(len(self.gamma))
+            self.scatter.correlate(motor, columns[None, self.rows_of(motor)])[0]
+            for motor in range(len(self.gamma))
         ]
         return np.concatenate(parts)
 
@@ -219,7 +265,12 @@ class Linearisation:
 
 
 def linearise(
-    observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
+    observation: Observation,
+    gains: FloatArray,
+    parameters: FloatArray,
+    noise: FloatArray,
+    *,
+    gains_fixed: bool,
 ) -> Linearisation:
     """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
     count, width = len(gains), len(gains) + len(parameters)
@@ -228,7 +279,9 @@ def linearise(
     parts: list[FloatArray] = []
     seen: list[IntArray] = []
     residual, current, squares = [], [], np.zeros(width)
-    rows_of = (columns[:, rows].T for columns, rows in zip(observation.motor_columns(), used, strict=True))
+    rows_of = (
+        columns[:, rows].T for columns, rows in zip(observation.motor_columns(), used, strict=True)
+    )
     preload = observation.preload[:, :, used[0]].transpose(2, 0, 1)
     for whole, left, measured in motor_jacobians(rows_of, preload, gains, parameters, noise):
         squares += np.einsum("rf,rf->f", whole, whole)
@@ -237,7 +290,9 @@ def linearise(
         residual.append(left)
         current.append(measured)
     norms = np.sqrt(squares[count:])
-    unit = np.concatenate((gains, np.divide(1.0, norms, where=norms > 0, out=np.ones(len(parameters)))))[first:]
+    unit = np.concatenate(
+        (gains, np.divide(1.0, norms, where=norms > 0, out=np.ones(len(parameters))))
+    )[first:]
     for part, held in zip(parts, seen, strict=True):
         np.multiply(part, unit[held, None], out=part)
     source = np.concatenate(used)
@@ -252,12 +307,18 @@ def linearise(
         noise=noise,
         free=np.arange(first, width),
         scale=unit,
-        transform=whitening_transform(observation.preload.transpose(2, 0, 1), gains, noise) if preload.size else None,
+        transform=whitening_transform(observation.preload.transpose(2, 0, 1), gains, noise)
+        if preload.size
+        else None,
     )
 
 
 def motor_jacobians(
-    rows: Iterable[FloatArray], preload: FloatArray, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+    rows: Iterable[FloatArray],
+    preload: FloatArray,
+    gains: FloatArray,
+    parameters: FloatArray,
+    noise: FloatArray,
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
     """J, e and the measured current in units of its noise, of each motor's equations in turn.
 
@@ -273,7 +334,9 @@ def motor_jacobians(
     currents = PreloadedCurrents.of_rows(list(rows), preload)
     whitened = currents.whitened(gains, noise)
     residual = whitened.residual(gains, parameters)
-    jacobian = np.concatenate((-currents.corrected(gains, noise, whitened, residual), whitened.linear), axis=1)
+    jacobian = np.concatenate(
+        (-currents.corrected(gains, noise, whitened, residual), whitened.linear), axis=1
+    )
     parts = (np.split(part, len(gains)) for part in (jacobian, residual, whitened.drive @ gains))
     yield from zip(*parts, strict=True)
 
@@ -281,10 +344,12 @@ def motor_jacobians(
 def motor_jacobian(
     rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p) and (r,).
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p)
+    and (r,).
 
     Args:
-        rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the same JᵀJ and Jᵀe.
+        rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the
+            same JᵀJ and Jᵀe.
         motor: i.
         gains, parameters: where to linearise.
         noise: σ of each motor's current [A].
@@ -299,7 +364,8 @@ def motor_jacobian(
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (C, f).
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c,
+    shape (C, f).
 
     Args:
         grams: G_c = J_cᵀJ_c of each cluster, shape (C, f, f).
@@ -309,7 +375,9 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
     # In units in which every unknown is seen equally well: kilograms are beside kg m².
     unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
     rest = (hessian - grams) * np.outer(unit, unit)
-    return -np.stack([_solved(matrix, score * unit) * unit for matrix, score in zip(rest, scores, strict=True)])
+    return -np.stack(
+        [_solved(matrix, score * unit) * unit for matrix, score in zip(rest, scores, strict=True)]
+    )
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -320,22 +388,26 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c, shape (C, f)."""
+    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c,
+    shape (C, f).
+    """
     centred = shifts - shifts.mean(axis=0)
     return np.asarray((len(shifts) - 1) / len(shifts) * (centred.T @ centred))
 
 
 def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
-    """Join neighbouring clusters of a run in pairs, again and again, until they are independent of each other.
+    """Join neighbouring clusters of a run in pairs, again and again,
+    until they are independent of each other.
 
-    Clusters are moves, and pieces of 2 s of longer moves: long beside the noise of drives, but not beside every misfit
-    of a model. The correlation of neighbours, in units in which all unknowns are known equally well, is
+    Clusters are moves, and pieces of 2 s of longer moves: long beside the noise of drives, but not
+    beside every misfit of a model. The correlation of neighbours, in units in which all unknowns
+    are known equally well, is
 
         r = Σ z_cᵀz_c₊₁ / Σ z_cᵀz_c,      z = L⁻¹ s,      L Lᵀ = H,
 
-    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent clusters is a little
-    below zero, because all scores together are zero. Blocks become longer until r no longer shows (batch means:
-    Fishman 1978).
+    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent
+    clusters is a little below zero, because all scores together are zero. Blocks become longer
+    until r no longer shows (batch means: Fishman 1978).
 
     Args:
         grams: G_c of each cluster, shape (C, f, f), in the order of time.
@@ -343,7 +415,8 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         runs: run of each cluster, shape (C,).
 
     Returns:
-        first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
+        first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as
+        many clusters.
     """
     starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
@@ -356,7 +429,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         products = np.sum(z[1:] * z[:-1], axis=1)[runs[1:] == runs[:-1]]
         if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
             return starts
-        first = np.sort(np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)]))
+        first = np.sort(
+            np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)])
+        )
         if len(first) < MIN_MOVES_TO_LEAVE_OUT:
             return starts
         starts, scores, runs = starts[first], np.add.reduceat(scores, first), runs[first]
@@ -373,16 +448,18 @@ def jackknife_covariance(
 ) -> FloatArray:
     """Covariance of (gains, parameters) from leaving out one move at a time, zero for fixed gains.
 
-    The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not independent, moves
-    nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3; docs/explanation/uncertainty.md).
-    Where they are not, several are left out together (`independent_blocks`).
+    The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not
+    independent, moves nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3;
+    docs/explanation/uncertainty.md). Where they are not, several are left out together
+    (`independent_blocks`).
 
     Args:
         system: of the fit.
         gains, parameters: the estimate, gains in Nm/A, shapes (m,) and (p,).
         noise: σ_i of each motor's current [A], shape (m,).
         gains_fixed: the gains were given.
-        recorded: equations whose residuals count, where those of ``system`` are projected on instruments.
+        recorded: equations whose residuals count, where those of ``system`` are projected on
+            instruments.
 
     Returns:
         shape (m + p, m + p).
@@ -395,11 +472,15 @@ def jackknife_covariance(
         raise TooFewMoves(clusters, MIN_MOVES_TO_LEAVE_OUT)
     free = slice(count if gains_fixed else 0, size)
     grams, scores = np.zeros((clusters, size, size)), np.zeros((clusters, size))
-    for index, (cluster, own) in enumerate(zip(system.clusters, (recorded or system).clusters, strict=True)):
+    for index, (cluster, own) in enumerate(
+        zip(system.clusters, (recorded or system).clusters, strict=True)
+    ):
         equations = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
         for motor, (jacobian, left, _) in enumerate(equations):
             same = own[motor] is cluster[motor]
-            residual = left if same else motor_jacobian(own[motor], motor, gains, parameters, noise)[1]
+            residual = (
+                left if same else motor_jacobian(own[motor], motor, gains, parameters, noise)[1]
+            )
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
     runs = np.array([run for run, _ in system.cluster_runs])
@@ -414,7 +495,9 @@ def jackknife_covariance(
 
 @dataclass(frozen=True, slots=True)
 class MotorRows:
-    """Rows of one motor in a problem cut into folds: they follow each other, sorted by fold and cluster."""
+    """Rows of one motor in a problem cut into folds:
+    they follow each other, sorted by fold and cluster.
+    """
 
     motor: int  #: index
     rows: slice  #: among those of the problem
@@ -425,24 +508,35 @@ class MotorRows:
     equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …, a, b).
+        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …,
+        a, b).
 
         Args:
             first, second: columns first, shapes (…, a, rows) and (…, b, rows).
         """
         out = np.empty((len(self.starts), *first.shape[:-1], second.shape[-2]))
-        for product, start, stop in zip(out, self.starts, (*self.starts[1:], first.shape[-1]), strict=True):
-            np.matmul(first[..., start:stop], np.swapaxes(second[..., start:stop], -1, -2), out=product)
+        for product, start, stop in zip(
+            out, self.starts, (*self.starts[1:], first.shape[-1]), strict=True
+        ):
+            np.matmul(
+                first[..., start:stop], np.swapaxes(second[..., start:stop], -1, -2), out=product
+            )
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
-        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,) or (p, f)."""
+        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,)
+        or (p, f).
+        """
         ends = (*self.starts[1:], self.equations.shape[1])
         blocks = zip(steps, self.starts, ends, strict=True)
-        return np.concatenate([x[..., self.seen] @ self.equations[:-2, a:b] for x, a, b in blocks], axis=-1)
+        return np.concatenate(
+            [x[..., self.seen] @ self.equations[:-2, a:b] for x, a, b in blocks], axis=-1
+        )
 
     def by_fold(self, products: FloatArray, count: int) -> FloatArray:
-        """Products of each block, shape (blocks, …), summed over each of so many folds, shape (count, …)."""
+        """Products of each block, shape (blocks, …), summed over each of so many folds,
+        shape (count, …).
+        """
         folds, first = np.unique(self.fold, return_index=True)
         out = np.zeros((count, *products.shape[1:]))
         out[folds] = np.add.reduceat(products, first, axis=0)
@@ -451,13 +545,16 @@ class MotorRows:
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
+    """A linearised problem cut into folds of whole moves,
+    with everything that cross-validation reuses.
 
-    A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over blocks.
+    A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over
+    blocks.
     """
 
     linearisation: Linearisation  #: its rows sorted by motor, fold and cluster
-    moves: int  #: number of whole moves distributed over the folds; a cluster may be only a piece of one
+    #: number of whole moves distributed over the folds; a cluster may be only a piece of one
+    moves: int
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
     motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
     full_factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
@@ -468,7 +565,8 @@ class Folds:
     part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
-    residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
+    #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
+    residual: FloatArray
     #: Cholesky factor of the JᵀJ of the estimate, in which rows of a run share no errors.
     estimate_factor: tuple[FloatArray, bool]
 
@@ -486,30 +584,40 @@ class Folds:
 
 
 def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> Folds:
-    """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
+    """Deal the moves out to folds in turn, so that every fold sees every run;
+    a move is never parted.
 
     Args:
         problem: around an estimate.
-        move_of: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
+        move_of: the move that each cluster is a piece of, shape (clusters,); the clusters
+            themselves when None.
 
     Raises:
         TooFewMoves: to leave some out.
     """
-    move_of = np.arange(problem.cluster_count) if move_of is None else np.unique(move_of, return_inverse=True)[1]
+    move_of = (
+        np.arange(problem.cluster_count)
+        if move_of is None
+        else np.unique(move_of, return_inverse=True)[1]
+    )
     moves = int(move_of.max()) + 1
     if moves < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
     fold_of = move_of % FOLDS
     motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    orders = [order[problem.rows_of(motor)] - problem.rows_of(motor).start for motor in range(motors)]
+    orders = [
+        order[problem.rows_of(motor)] - problem.rows_of(motor).start for motor in range(motors)
+    ]
     problem = _with_sorted_rows(problem, order, orders)
     scatter = problem.scatter
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
     cluster, motor = problem.cluster[starts], problem.motor[starts]
-    blocks = tuple(zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True))
+    blocks = tuple(
+        zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True)
+    )
     cluster_hessian = np.zeros((problem.cluster_count, width, width))
     cluster_score = np.zeros((problem.cluster_count, width))
     part_hessian, motor_score = np.zeros((FOLDS, motors, width, width)), np.zeros((motors, width))
@@ -520,7 +628,13 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         np.take(jacobian.parts[i], orders[i], axis=1, out=equations[:-2], mode="clip")
         sorted_parts[i], equations[-2] = equations[:-2], problem.residual[whole]
         own = MotorRows(
-            int(i), whole, starts[here] - whole.start, fold_of[cluster[here]], cluster[here], seen, equations
+            int(i),
+            whole,
+            starts[here] - whole.start,
+            fold_of[cluster[here]],
+            cluster[here],
+            seen,
+            equations,
         )
         by_motor.append(own)
         products = own.sums(equations[:-2], equations[:-1])
@@ -536,11 +650,14 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     factors, scores_without = [], []
     for k in range(FOLDS):
         rest = hessian - by_fold[k]
-        # A direction that only this fold sees must not explode: it stays where the whole data put it.
+        # A direction that only this fold sees must not explode: it stays where the whole data put
+        # it.
         rest[np.diag_indices_from(rest)] += RIDGE * np.diag(hessian)
         factors.append(linalg.cho_factor(rest, lower=True))
         scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
-    steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)]
+    steps = [
+        linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)
+    ]
     residual = np.empty_like(problem.residual)
     part_score = np.zeros((FOLDS, motors, width))
     for own in by_motor:
@@ -549,7 +666,8 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         residual[own.rows] = left
         parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], FOLDS)
         part_score[:, own.motor][:, own.seen] = parts
-    problem = replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts)))  # held once, by MotorRows
+    # Held once, by MotorRows
+    problem = replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts)))
     full_factor = (linalg.cho_factor(hessian, lower=True)[0], True)
     return Folds(
         linearisation=problem,
@@ -565,20 +683,32 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         part_score=part_score,
         motor_score=motor_score,
         residual=residual,
-        estimate_factor=full_factor if scatter is None else _estimate_factor(problem, scatter, hessian),
+        estimate_factor=full_factor
+        if scatter is None
+        else _estimate_factor(problem, scatter, hessian),
     )
 
 
-def _with_sorted_rows(problem: Linearisation, order: IntArray, orders: Sequence[IntArray]) -> Linearisation:
-    """Sort everything but the Jacobian: all rows by one order, the scatter by those of each motor."""
+def _with_sorted_rows(
+    problem: Linearisation, order: IntArray, orders: Sequence[IntArray]
+) -> Linearisation:
+    """Sort everything but the Jacobian:
+    all rows by one order, the scatter by those of each motor.
+    """
     sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
     scatter = None if problem.scatter is None else problem.scatter.sorted(orders)
     return replace(problem, scatter=scatter, **sorted_rows)
 
 
-def _estimate_factor(problem: Linearisation, scatter: RunScatter, hessian: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian, from JᵀJ."""
+def _estimate_factor(
+    problem: Linearisation, scatter: RunScatter, hessian: FloatArray
+) -> tuple[FloatArray, bool]:
+    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian,
+    from JᵀJ.
+    """
     whole = hessian.copy()
-    for motor, (part, seen) in enumerate(zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)):
+    for motor, (part, seen) in enumerate(
+        zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)
+    ):
         whole[np.ix_(seen, seen)] += scatter.shared(motor, part)
     return linalg.cho_factor(whole, lower=True)[0], True

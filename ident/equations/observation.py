@@ -1,6 +1,8 @@
-"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for everything that looks into a residual.
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq.
+17), for everything that looks into a residual.
 
-An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a usual length.
+An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a
+usual length.
 """
 
 from __future__ import annotations
@@ -40,11 +42,14 @@ class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
     current: FloatArray  #: decimated current references of the motors [A], shape (m, r)
-    regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (m, b, r)
+    #: torque at each joint per unit of each base parameter: W without effects, shape (m, b, r)
+    regressor: FloatArray
     effects: FloatArray  #: the same of each effect, the other columns of W, shape (m, e, r)
-    flange: FloatArray  #: columns of the payload's link, also of the payload while it was mounted, shape (m, 10, r)
+    #: columns of the payload's link, also of the payload while it was mounted, shape (m, 10, r)
+    flange: FloatArray
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (m, r)
-    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    motor_use: BoolArray
     time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
     run: IntArray  #: index of each row's run, shape (r,)
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
@@ -57,30 +62,44 @@ class Observation(Equations):
         """[W | W_uL] of some rows of a joint, shape (p, rows)."""
         parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
         for index, indices in enumerate(self.payload_columns):
-            parts.append(self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index))
+            parts.append(
+                self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index)
+            )
         return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m, rows)."""
+        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m,
+        rows).
+        """
         # An index of −1, no load, takes the last row, which stays zero.
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
             weights[index] = payload.known_parameters
-        return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
+        return np.asarray(
+            np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]])
+        )
 
     def motor_columns(self) -> Iterator[FloatArray]:
-        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r).
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first,
+        shape (p + 2, r).
 
         Of a redundantly driven robot V_i in place of v_i, shape (m + p + 1, r).
         """
         known = self.known()
         for motor, to_motor in enumerate(self.drive_train.to_motor):
-            current = self.drive[motor] if self.preload.size else self.current[motor][None]
-            torque = motor_columns(to_motor, lambda joint: np.concatenate((self.of_joint(joint), known[joint][None])))
+            if self.preload.size:
+                current = self.drive[motor]
+            else:
+                current = self.current[motor][None]
+            torque = motor_columns(
+                to_motor, lambda joint: np.concatenate((self.of_joint(joint), known[joint][None]))
+            )
             yield np.concatenate((current, torque))
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (m, rows)."""
+        """Y = V g: joint torque from the measured current references (eq.
+        4 through R) [Nm], shape (m, rows).
+        """
         if self.preload.size:
             return np.asarray(np.einsum("amr,m->ar", self.drive[:, :, rows], gains))
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
@@ -90,17 +109,24 @@ class Observation(Equations):
         return replace(self, **{name: getattr(self, name)[..., rows] for name in OBSERVATION_ROWS})
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (m, extra, r) [Nm per unit]; what preload hides of them is left out."""
+        """Add columns to W, torque of shape (m, extra, r) [Nm per unit];
+        what preload hides of them is left out.
+        """
         if self.preload.size:
             hidden = np.einsum("alr,apr->lpr", self.preload, torque)
             torque = torque - np.einsum("alr,lpr->apr", self.preload, hidden)
-        return replace(self, columns=self.columns + columns, effects=np.concatenate((self.effects, torque), axis=1))
+        return replace(
+            self,
+            columns=self.columns + columns,
+            effects=np.concatenate((self.effects, torque), axis=1),
+        )
 
     def system(self, demanded: Observation | None = None) -> System:
         """Reduce the rows to triangles.
 
         Args:
-            demanded: the same rows and columns for the demanded motion: they become the system's instruments.
+            demanded: the same rows and columns for the demanded motion: they become the system's
+                instruments.
         """
         support = self._support()
         if demanded is not None:
@@ -117,7 +143,9 @@ class Observation(Equations):
         )
 
     def _parts(self) -> list[FloatArray]:
-        """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m, …, r)."""
+        """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m,
+        …, r).
+        """
         parts = [self.regressor, self.effects]
         if self.payloads:
             parts.append(self.flange)
@@ -180,15 +208,24 @@ def observe(
     base = list(like.base.independent)
     mountings = [payload.mounting for payload in like.payloads]
     parts: list[tuple[Rows, FloatArray, FloatArray]] = []
-    run, move, mounting = [], [], []
-    first_move, shared = 0, ("current", "use", "motor_use", "time_s", "drive", "preload")
+    run = []
+    move = []
+    mounting = []
+    first_move = 0
+    shared = ("current", "use", "motor_use", "time_s", "drive", "preload")
     names: list[str] = []
     for index, data in enumerate(runs):
         pieces = rows_of(model, data, conditioning) if built is None else built[index]
         names.append(data.name)
-        last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
+        last = first_move
+        if data.payload is None:
+            mounted = -1
+        else:
+            mounted = mountings.index(data.payload.mounting)
         for rows in pieces:
-            parts.append((rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange])))
+            parts.append(
+                (rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange]))
+            )
             move.append(rows.move + first_move)
             last = int(move[-1].max()) + 1
             run.append(np.full(len(rows.move), index, dtype=np.int64))
@@ -208,19 +245,25 @@ def observe(
         payload_columns=like.payload_columns,
         runs=tuple(names),
         conditioning=conditioning,
-        **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
+        **{
+            name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1)
+            for name in shared
+        },
     )
 
 
 def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observation) -> Observation:
-    """Replace the declared columns by those of the demanded motion, where a run's is known; effects' columns stay.
+    """Replace the declared columns by those of the demanded motion, where a run's is known;
+    effects' columns stay.
 
     Args:
         model: the declared model.
         datasets: the runs of the rows.
         rows: of these runs.
     """
-    regressor, flange, base = rows.regressor.copy(), rows.flange.copy(), list(rows.base.independent)
+    regressor = rows.regressor.copy()
+    flange = rows.flange.copy()
+    base = list(rows.base.independent)
     for index, data in enumerate(datasets):
         if data.demanded is not None:
             own = rows.run == index

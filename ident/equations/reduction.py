@@ -1,12 +1,14 @@
-"""Runs, one after the other, reduced to triangles: the observation matrix is never held whole (TSQR).
+"""Runs, one after the other, reduced to triangles:
+the observation matrix is never held whole (TSQR).
 
-`reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows have, and all ten
-parameters of the payload of each mounting; `System.holding` then gives some of them a value. The rows of `reduce_runs`
-have the standard parameters: `regrouped` chooses base parameters among them, and moves what is known of the payloads to
-W_kL χ_kL. So the same triangles serve every such choice.
+`reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows
+have, and all ten parameters of the payload of each mounting; `System.holding` then gives some of
+them a value. The rows of `reduce_runs` have the standard parameters: `regrouped` chooses base
+parameters among them, and moves what is known of the payloads to W_kL χ_kL. So the same triangles
+serve every such choice.
 
-A payload has the columns of the link that carries it, in the rows in which it was mounted: triangles hold them once,
-separately for each mounting.
+A payload has the columns of the link that carries it, in the rows in which it was mounted:
+triangles hold them once, separately for each mounting.
 """
 
 from __future__ import annotations
@@ -30,11 +32,14 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, DriveTrain, Model
 
 MAX_CLUSTERS = 256
-"""Moves of very long data are joined with their neighbours: 256 clusters estimate the scatter as well as 3000."""
+"""Moves of very long data are joined with their neighbours:
+256 clusters estimate the scatter as well as 3000.
+"""
 
 BODY = len(LINK_PARAMETERS)  #: Parameters of a payload
 
-ReadRun = tuple[str, Payload | None, Iterable[Rows]]  #: Name of a run, what was mounted, and its rows, piece by piece
+#: Name of a run, what was mounted, and its rows, piece by piece
+ReadRun = tuple[str, Payload | None, Iterable[Rows]]
 
 
 def rows_of_runs(
@@ -45,7 +50,9 @@ def rows_of_runs(
     instruments: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
-    """Differentiate runs one after the other and build their rows; arguments and errors are those of `reduce_runs`."""
+    """Differentiate runs one after the other and build their rows;
+    arguments and errors are those of `reduce_runs`.
+    """
     for run in runs:
         data = differentiate(run, model.drive_train, conditioning)
         if instruments:
@@ -69,7 +76,8 @@ def reduce_runs(
         runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
-        instruments: keep those of the demanded motion beside the rows; where it is not known, the recorded one serves.
+        instruments: keep those of the demanded motion beside the rows; where it is not known, the
+            recorded one serves.
         chunk_rows: rows built at once; the result does not depend on it.
 
     Returns:
@@ -102,11 +110,15 @@ def reduce_built(
     )
 
 
-def standard_equations(model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()) -> Equations:
+def standard_equations(
+    model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()
+) -> Equations:
     """The unknowns before any regrouping: every standard parameter, and none of the payloads."""
     names = tuple(column.name for column in model.columns)
     every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
-    return Equations(model, every, model.columns, tuple(payloads), ((),) * len(payloads), tuple(runs))
+    return Equations(
+        model, every, model.columns, tuple(payloads), ((),) * len(payloads), tuple(runs)
+    )
 
 
 # From rows to triangles
@@ -126,15 +138,20 @@ def reduce_rows(
 
     Args:
         unknowns: model and columns of the robot; payloads known beforehand.
-        runs: read one after the other; their columns are those of ``unknowns``, and perhaps others for ``flange``.
+        runs: read one after the other; their columns are those of ``unknowns``, and perhaps others
+            for ``flange``.
         support: mask of the columns that each joint has, shape (m, c).
-        flange: which columns are those of the link that carries the payload, shape (10,); none without payloads.
-        given: unknowns that get a value, as for `System.holding`, where all payloads are known beforehand.
+        flange: which columns are those of the link that carries the payload, shape (10,); none
+            without payloads.
+        given: unknowns that get a value, as for `System.holding`, where all payloads are known
+            beforehand.
         instruments: keep those of the demanded motion beside the rows.
-        compact: reduce the motors' rows of a move to a triangle, and join moves where there are very many.
+        compact: reduce the motors' rows of a move to a triangle, and join moves where there are
+            very many.
 
     Returns:
-        equations with all ten parameters of each payload among the unknowns, but for those that are given.
+        equations with all ten parameters of each payload among the unknowns, but for those that are
+        given.
 
     Raises:
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
@@ -151,22 +168,30 @@ def reduce_rows(
 
 @dataclass(frozen=True, slots=True)
 class _Cluster:
-    """Motor rows of one move, or of several that follow each other in one run, in the columns that each motor has."""
+    """Motor rows of one move, or of several that follow each other in one run,
+    in the columns that each motor has.
+    """
 
     mounting: int  #: index into the payloads, −1 without load
     run: int  #: index into the runs
-    #: For each motor the rows, or where they are many their triangle, of [v_i | (T W)_i], with instruments
-    #: [v_i | (T W)_i | (T Z)_i]. Of a redundantly driven robot always the rows, with the torques per unit of all gains,
-    #: V_i, in place of v_i.
+    #: For each motor the rows, or where they are many their triangle, of [v_i | (T W)_i], with
+    #: instruments [v_i | (T W)_i | (T Z)_i]. Of a redundantly driven robot always the rows, with
+    #: the torques per unit of all gains, V_i, in place of v_i.
     factors: tuple[FloatArray, ...]
-    preload: FloatArray  #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+    #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+    preload: FloatArray
 
 
 class _Reducer:
     """Triangles of the rows so far, in the columns that each joint and each motor has."""
 
     def __init__(
-        self, unknowns: Equations, support: BoolArray, flange: IntArray, instruments: bool, compact: bool
+        self,
+        unknowns: Equations,
+        support: BoolArray,
+        flange: IntArray,
+        instruments: bool,
+        compact: bool,
     ) -> None:
         self.unknowns = unknowns
         self.flange = flange
@@ -194,7 +219,9 @@ class _Reducer:
         moves: dict[int, list[_Cluster]] = {}
         for rows in pieces:
             for joint, columns in enumerate(self.of_joint):
-                factors[joint] = qr_update(factors[joint], _rows_of_joint(self.model, rows, joint, columns))
+                factors[joint] = qr_update(
+                    factors[joint], _rows_of_joint(self.model, rows, joint, columns)
+                )
             self.joint_rows += rows.use.sum(axis=1)
             self.motor_rows += rows.motor_use.sum(axis=1)
             self.has_demanded_motion |= rows.instrument is not rows.standard
@@ -207,11 +234,15 @@ class _Reducer:
                 preload = rows.preload[:, :, counted].transpose(2, 0, 1)
                 moves.setdefault(move, []).append(_Cluster(mounting, len(self.names), own, preload))
         for parts in moves.values():
-            self.clusters.append(parts[0] if len(parts) == 1 and not self.compact else _merged(parts))
+            self.clusters.append(
+                parts[0] if len(parts) == 1 and not self.compact else _merged(parts)
+            )
         self.names.append(name)
 
     def _by_move(self, rows: Rows, motor: int, moves: IntArray) -> list[FloatArray]:
-        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i], in the rows of each move."""
+        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i],
+        in the rows of each move.
+        """
         to_motor = self.model.drive_train.to_motor[motor]
         held = self.of_motor[motor]
         parts = [rows.drive[motor] if self.model.is_redundant else rows.current[motor][None]]
@@ -225,7 +256,9 @@ class _Reducer:
         return [own.T for own in np.split(columns, ends, axis=1)]
 
     def system(self, given: Mapping[int, float]) -> System:
-        """The equations with all columns but those that are given; what a joint or motor does not have is zero."""
+        """The equations with all columns but those that are given;
+        what a joint or motor does not have is zero.
+        """
         without_clusters = self._without_clusters()
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
@@ -256,7 +289,9 @@ class _Reducer:
         )
 
     def _joint(self, joint: int) -> FloatArray:
-        """[V | −W | −W_L of each mounting | 0] of a joint: the triangles of all mountings below each other."""
+        """[V | −W | −W_L of each mounting | 0] of a joint:
+        the triangles of all mountings below each other.
+        """
         count = len(self.of_joint)
         columns = self.of_joint[joint]
         motors = np.count_nonzero(columns < count)
@@ -270,11 +305,15 @@ class _Reducer:
         return np.concatenate(parts)
 
     def _motor(self, motor: int) -> FloatArray:
-        """[v_i | W | W_L of each mounting | 0] of a motor: the triangles of all mountings below each other."""
+        """[v_i | W | W_L of each mounting | 0] of a motor:
+        the triangles of all mountings below each other.
+        """
         width = self.leading + len(self.of_motor[motor])
         parts: list[FloatArray] = [np.empty((0, self.leading + self._width))]
         for mounting in self.joints:
-            rows = [one.factors[motor][:, :width] for one in self.clusters if one.mounting == mounting]
+            rows = [
+                one.factors[motor][:, :width] for one in self.clusters if one.mounting == mounting
+            ]
             parts.append(self._currents(triangle(rows, width), motor, mounting))
         return np.concatenate(parts)
 
@@ -290,7 +329,9 @@ class _Reducer:
         given: GivenUnknowns,
         first: int,
     ) -> tuple[FloatArray, ...]:
-        """Rows of each motor: some columns of a cluster, so many of currents first, without those that are given."""
+        """Rows of each motor: some columns of a cluster, so many of currents first,
+        without those that are given.
+        """
         motors: list[FloatArray] = []
         for motor, factor in enumerate(cluster.factors):
             rows = columns(factor, motor, cluster.mounting)
@@ -324,12 +365,17 @@ class _Reducer:
 def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:
     """Mask of the columns of [V | W] that each joint has, shape (m, m + c)."""
     direction = model.drive_train.direction
-    currents = np.ones_like(direction, dtype=np.bool_) if model.is_redundant else direction.T != 0.0
+    if model.is_redundant:
+        currents = np.ones_like(direction, dtype=np.bool_)
+    else:
+        currents = direction.T != 0.0
     return np.concatenate((currents, support), axis=1)
 
 
 def motor_support(train: DriveTrain, support: BoolArray) -> BoolArray:
-    """Mask of the columns of W that the equation of each motor has, from those of each joint, both of shape (m, c)."""
+    """Mask of the columns of W that the equation of each motor has, from those of each joint,
+    both of shape (m, c).
+    """
     mixed = np.abs(train.to_motor) > 0.0
     return np.asarray(mixed.astype(np.int64) @ support.astype(np.int64) > 0)
 
@@ -390,7 +436,8 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
             if known != payload:
                 raise DataUnfit(
                     run,
-                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another run; "
+                    f"mounting {payload.mounting!r} carries {payload} here and {known} in "
+                    "another run; "
                     "give each way of mounting a name of its own",
                 )
             return index
@@ -411,8 +458,8 @@ def regrouped(
     Args:
         standard: of `reduce_runs`.
         base: the base parameters; those that its rows show, when None.
-        payload_columns: the unknown parameters of each payload, as indices of LINK_PARAMETERS; those that its rows show
-            when None.
+        payload_columns: the unknown parameters of each payload, as indices of LINK_PARAMETERS;
+            those that its rows show when None.
 
     Raises:
         JointStill: a joint never moves, where the base parameters are looked for.
@@ -425,13 +472,16 @@ def regrouped(
     given = {index: 0.0 for index in range(count) if index not in base.independent}
     found = standard.holding(given | payload_values(standard.payloads, payload_columns, count))
     names = zip(base.names, found.columns, strict=True)
-    return replace(found, base=base, columns=tuple(Column(name, column.unit) for name, column in names))
+    return replace(
+        found, base=base, columns=tuple(Column(name, column.unit) for name, column in names)
+    )
 
 
 def payload_values(
     payloads: Sequence[Payload], payload_columns: Sequence[Sequence[int]], first: int
 ) -> dict[int, float]:
-    """Values of the payloads' parameters that are no unknowns, zero where not known, for `System.holding`.
+    """Values of the payloads' parameters that are no unknowns, zero where not known,
+    for `System.holding`.
 
     Args:
         payloads: of the system.
@@ -463,7 +513,9 @@ def shown_base(standard: System) -> BaseParameters:
 
 
 def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:
-    """The columns of W without what a payload adds to a friction that no bare row shows: the two are one parameter."""
+    """The columns of W without what a payload adds to a friction that no bare row shows:
+    the two are one parameter.
+    """
     if not model.friction_by_payload:
         return columns
     columns = columns.copy()
@@ -475,7 +527,9 @@ def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -
 
 
 def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
-    """For each mounting, its unknown parameters that a system in standard parameters shows (LINK_PARAMETERS)."""
+    """For each mounting, its unknown parameters that a system in standard parameters shows
+    (LINK_PARAMETERS).
+    """
     columns = _linear_columns(standard)
     chosen: list[tuple[int, ...]] = []
     for mounting, payload in enumerate(standard.payloads):
@@ -484,13 +538,20 @@ def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
         norms = np.linalg.norm(flange, axis=0)
         # On a platform that never turns, most of the ten are rounding errors beside the mass.
         shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
-        unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i])
+        unknown = tuple(
+            i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i]
+        )
         names = tuple(LINK_PARAMETERS[i] for i in unknown)
-        seen = base_parameters(flange[:, list(unknown)], names).independent if unknown else ()
+        if unknown:
+            seen = base_parameters(flange[:, list(unknown)], names).independent
+        else:
+            seen = ()
         chosen.append(tuple(unknown[i] for i in seen))
     return tuple(chosen)
 
 
 def _linear_columns(standard: System) -> FloatArray:
     """[W | W_L of each mounting] of all joints below each other."""
-    return np.concatenate([-factor[:, standard.axis_count : -1] for factor in standard.joints.factors])
+    return np.concatenate(
+        [-factor[:, standard.axis_count : -1] for factor in standard.joints.factors]
+    )

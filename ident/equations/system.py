@@ -18,7 +18,10 @@ from ident.model.model import Column, DriveTrain, Model
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Unknowns of eq. (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1)."""
+    """Unknowns of eq.
+
+    (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
+    """
 
     model: Model  #: the declared model
     base: BaseParameters  #: how the base parameters were regrouped
@@ -40,7 +43,9 @@ class Equations:
 
     @property
     def leading(self) -> int:
-        """How many columns of the motors' rows belong to currents: the own one, or with preload those of all motors."""
+        """How many columns of the motors' rows belong to currents:
+        the own one, or with preload those of all motors.
+        """
         return self.axis_count if self.model.is_redundant else 1
 
     @property
@@ -90,25 +95,31 @@ class System(Equations):
     """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
 
     joints: Triangles  #: of each joint's rows of W_tot, c = m + p + 1 columns
-    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
-    #: (T W χ + T W_kL χ_kL)_i holds one current alone.
+    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the
+    #: equation g_i v_i = (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
-    #: For each cluster the rows or the triangle of each motor's rows. Of a redundantly driven robot always the rows, of
-    #: all motors alike, and with the torque per unit of each gain in place of the own current: [V_i | …].
+    #: For each cluster the rows or the triangle of each motor's rows. Of a redundantly driven robot
+    #: always the rows, of all motors alike, and with the torque per unit of each gain in place of
+    #: the own current: [V_i | …].
     clusters: tuple[tuple[FloatArray, ...], ...]
     #: Of each cluster the index of its run, and that of its payload, −1 without load.
     cluster_runs: tuple[tuple[int, int], ...] = ()
-    #: Beside the rows of each cluster those of its instruments, [(T [Z | Z_uL])_i | (T Z_kL χ_kL)_i] of the demanded
-    #: motion; empty where none is known.
+    #: Beside the rows of each cluster those of its instruments, [(T [Z | Z_uL])_i | (T Z_kL
+    #: χ_kL)_i] of the demanded motion; empty where none is known.
     instruments: tuple[tuple[FloatArray, ...], ...] = ()
-    #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others empty.
+    #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others
+    #: empty.
     preload: tuple[FloatArray, ...] = ()
 
-    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
-        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
+    def weighted_singular_values(
+        self, solution: FloatArray, free: int, *, gains: bool
+    ) -> FloatArray:
+        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper
+        Table 5).
 
-        An effect's coefficient may have any unit, such as rad/Nm beside kg m². Its column is scaled to the median norm
-        of the base parameters' columns: otherwise the condition would depend on that unit.
+        An effect's coefficient may have any unit, such as rad/Nm beside kg m². Its column is scaled
+        to the median norm of the base parameters' columns: otherwise the condition would depend on
+        that unit.
 
         Args:
             solution: (g, χ, χ_uL, 1) of eq. (17).
@@ -120,7 +131,8 @@ class System(Equations):
         norms = np.linalg.norm(matrix, axis=0)
         base = np.array([column.name in self.base.names for column in self.columns], dtype=np.bool_)
         if base.any():
-            size, effects = np.median(norms[count + np.flatnonzero(base)]), count + np.flatnonzero(~base)
+            size = np.median(norms[count + np.flatnonzero(base)])
+            effects = count + np.flatnonzero(~base)
             matrix[:, effects] *= size / np.where(norms > 0.0, norms, 1.0)[effects]
         return singular_values(matrix[:, 0 if gains else count : -1])
 
@@ -130,8 +142,12 @@ class System(Equations):
         return tuple(self.runs[index] for index in sorted({run for run, _ in self.cluster_runs}))
 
     def preload_of(self, cluster: int) -> FloatArray:
-        """N of a cluster's rows, shape (rows, m, m − d); empty where no motor works against another."""
-        return self.preload[cluster] if self.preload else np.empty((0, self.axis_count, 0))
+        """N of a cluster's rows, shape (rows, m, m − d);
+        empty where no motor works against another.
+        """
+        if self.preload:
+            return self.preload[cluster]
+        return np.empty((0, self.axis_count, 0))
 
     @property
     def currents(self) -> Currents:
@@ -150,7 +166,8 @@ class System(Equations):
         """Give some unknowns a value: their columns join W_kL χ_kL.
 
         Args:
-            values: by index into ``unknowns``; zero takes a parameter out of the model (paper §4.2).
+            values: by index into ``unknowns``; zero takes a parameter out of the model (paper
+                §4.2).
         """
         given = GivenUnknowns.of(values, len(self.unknowns))
 
@@ -161,29 +178,43 @@ class System(Equations):
         payload_columns: list[tuple[int, ...]] = []
         first = len(self.columns)
         for indices in self.payload_columns:
-            payload_columns.append(tuple(own for place, own in enumerate(indices, first) if place not in values))
+            payload_columns.append(
+                tuple(own for place, own in enumerate(indices, first) if place not in values)
+            )
             first += len(indices)
         return replace(
             self,
-            columns=tuple(column for index, column in enumerate(self.columns) if index not in values),
+            columns=tuple(
+                column for index, column in enumerate(self.columns) if index not in values
+            ),
             payload_columns=tuple(payload_columns),
             joints=folded(self.joints, self.axis_count),
             motors=folded(self.motors, self.leading),
-            clusters=tuple(tuple(given.joined_in(rows, self.leading) for rows in cluster) for cluster in self.clusters),
-            instruments=tuple(tuple(given.joined_in(rows, 0) for rows in cluster) for cluster in self.instruments),
+            clusters=tuple(
+                tuple(given.joined_in(rows, self.leading) for rows in cluster)
+                for cluster in self.clusters
+            ),
+            instruments=tuple(
+                tuple(given.joined_in(rows, 0) for rows in cluster) for cluster in self.instruments
+            ),
         )
 
     def on_instruments(self) -> System:
-        """Replace each motor's columns by their projection on its instruments: the first of two stages.
+        """Replace each motor's columns by their projection on its instruments:
+        the first of two stages.
 
-        What is left of a column depends on the demanded motion alone; a disturbance that moved the arm is gone from it.
+        What is left of a column depends on the demanded motion alone; a disturbance that moved the
+        arm is gone from it.
         """
         projected = []
         for motor in range(self.axis_count):
             instruments = np.concatenate([cluster[motor] for cluster in self.instruments])
             seen = np.flatnonzero(np.any(instruments, axis=0))
             columns = np.concatenate([cluster[motor][:, 1:] for cluster in self.clusters])
-            both = triangle((np.concatenate((instruments[:, seen], columns), axis=1),), len(seen) + columns.shape[1])
+            both = triangle(
+                (np.concatenate((instruments[:, seen], columns), axis=1),),
+                len(seen) + columns.shape[1],
+            )
             stage, _ = solve(both[: len(seen), : len(seen)], both[: len(seen), len(seen) :])
             projected.append(
                 [
@@ -192,7 +223,11 @@ class System(Equations):
                 ]
             )
         factors = tuple(triangle(rows, rows[0].shape[1]) for rows in projected)
-        return replace(self, motors=Triangles(factors, self.motors.rows), clusters=tuple(zip(*projected, strict=True)))
+        return replace(
+            self,
+            motors=Triangles(factors, self.motors.rows),
+            clusters=tuple(zip(*projected, strict=True)),
+        )
 
 
 def require_rows(system: System) -> None:
@@ -208,13 +243,16 @@ def require_rows(system: System) -> None:
             joints = np.flatnonzero((train.direction[motor] != 0) | (train.to_motor[motor] != 0))
             raise DataUnfit(
                 ", ".join(system.runs),
-                f"{' and '.join(axes[joint].name for joint in joints)}, which motor {motor + 1} turns with, "
-                "never move at the same time; record moves in which they do, or use another estimator than ml",
+                f"{' and '.join(axes[joint].name for joint in joints)}, which motor {motor + 1} "
+                "turns with, "
+                "never move at the same time; record moves in which they do, or use another "
+                "estimator than ml",
             )
         if rows <= len(system.unknowns):
             raise DataUnfit(
                 ", ".join(system.runs),
-                f"motor {motor + 1} has {int(rows)} usable rows for {len(system.unknowns)} unknowns; "
+                f"motor {motor + 1} has {int(rows)} usable rows for {len(system.unknowns)} "
+                "unknowns; "
                 "record longer, or move it more",
             )
 
@@ -240,8 +278,8 @@ def require_distinct(system: System, *, gains: bool) -> None:
         gains: whether the gains are unknown too.
 
     Raises:
-        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the payload, or a
-            motor's current is constant zero.
+        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the
+            payload, or a motor's current is constant zero.
     """
     names = tuple(column.name for column in system.unknowns)
     columns = np.concatenate([factor[:, system.axis_count :] for factor in system.joints.factors])
@@ -253,13 +291,15 @@ def require_distinct(system: System, *, gains: bool) -> None:
     lost = tuple(name for index, name in enumerate(names) if index not in independent)
     if lost:
         is_bare_seen = any(mounting < 0 for _, mounting in system.cluster_runs)
-        missing = (
-            "move every joint through more of its range" if is_bare_seen else "record the same robot without load too"
-        )
+        if is_bare_seen:
+            missing = "move every joint through more of its range"
+        else:
+            missing = "record the same robot without load too"
         robot = system.model.robot
         if is_bare_seen and lost == (KNOWN_PAYLOAD,) and robot.carrier < robot.joint_count - 1:
             missing = (
-                "what is known of the payload does not show behind so few joints: say more of it, as its centre of "
+                "what is known of the payload does not show behind so few joints: say more of it, "
+                "as its centre of "
                 "mass (`centre_m`) beside its mass"
             )
         raise RankDeficient(f"the data do not distinguish payload and robot: {missing}", lost)
@@ -269,5 +309,7 @@ def require_distinct(system: System, *, gains: bool) -> None:
             if system.motors.rows[motor] and not np.any(factor[:, own]):
                 name = f"gain {motor + 1}"
                 raise RankDeficient(
-                    f"the current of motor {motor + 1} is zero throughout: is its channel connected?", (name,)
+                    f"the current of motor {motor + 1} is zero throughout: is its channel "
+                    "connected?",
+                    (name,),
                 )

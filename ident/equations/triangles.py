@@ -1,10 +1,11 @@
 """Rows reduced to triangles, however many there were.
 
-R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never held whole. R is
-unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step is Householder's (LAPACK ``tpqrt``, which
-knows that the upper part is a triangle), so R carries a backward error of some ε ‖column‖ in every column, whatever the
-condition number. The Gram matrix is twice as fast and squares the condition number: singular values below √ε ‖W‖ are
-lost in it (docs/evidence has both, measured).
+R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never
+held whole. R is unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step is
+Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a
+backward error of some ε ‖column‖ in every column, whatever the condition number. The Gram matrix is
+twice as fast and squares the condition number: singular values below √ε ‖W‖ are lost in it
+(docs/evidence has both, measured).
 """
 
 from __future__ import annotations
@@ -20,22 +21,30 @@ from ident.arrays import FloatArray, IntArray
 BLOCK_ROWS = 1024  #: Rows folded in at once: 80 columns of them stay in a core's own cache
 
 REFLECTORS = 8
-"""Householder vectors applied together; wider blocks cost more inside themselves than they save on the rest."""
+"""Householder vectors applied together; wider blocks cost more inside themselves than they save on
+the rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x."""
+    """R of the QR factorisation of each axis' equations;
+    ‖R x‖ is the norm of their residual for any x.
+    """
 
     factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
     rows: IntArray  #: number of equations of each axis, shape (m,)
 
     def stacked(self, weight: FloatArray) -> FloatArray:
         """All axes below each other, each scaled by its weight."""
-        return np.concatenate([factor * scale for factor, scale in zip(self.factors, weight, strict=True)])
+        return np.concatenate(
+            [factor * scale for factor, scale in zip(self.factors, weight, strict=True)]
+        )
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
-        """Standard deviation of each axis' residual R x; ``free`` parameters are shared among the axes (eq. 9)."""
+        """Standard deviation of each axis' residual R x;
+        ``free`` parameters are shared among the axes (eq. 9).
+        """
         size = self.square_sum(vector)
         return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(self.rows), 1.0)))
 
@@ -52,11 +61,15 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
         columns: c, for the case of no rows.
     """
     rows = np.concatenate([np.empty((0, columns)), *parts])
-    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64) if len(rows) > columns else rows
+    if len(rows) > columns:
+        return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+    return rows
 
 
 def triangle_of(columns: FloatArray) -> FloatArray:
-    """R of rows that are given column by column, shape (c, k) → (≤c, c); columns that are zero take no part."""
+    """R of rows that are given column by column, shape (c, k) → (≤c, c);
+    columns that are zero take no part.
+    """
     held = np.flatnonzero(columns.any(axis=1))
     out = np.zeros((len(held), len(columns)))
     out[:, held] = qr_update(None, columns[held])
@@ -66,7 +79,8 @@ def triangle_of(columns: FloatArray) -> FloatArray:
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
 
-    Scaling columns changes no least-squares solution, but spares digits where kilograms are beside kg m².
+    Scaling columns changes no least-squares solution, but spares digits where kilograms are beside
+    kg m².
     """
     norms = np.linalg.norm(matrix, axis=0)
     norms[norms == 0.0] = 1.0
@@ -86,22 +100,34 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
 
     Args:
         triangle: what an earlier call returned, None at the start; left as it is.
-        columns: further rows, column by column with time last, shape (c, k); any k, none too; left as they are.
+        columns: further rows, column by column with time last, shape (c, k); any k, none too; left
+            as they are.
 
     Returns:
-        upper triangular, shape (c, c); with fewer than c independent rows it is singular, but never smaller.
+        upper triangular, shape (c, c); with fewer than c independent rows it is singular, but never
+        smaller.
 
     Raises:
         ValueError: the number of columns is not that of the triangle.
     """
     count, rows = columns.shape
     if triangle is not None and triangle.shape != (count, count):
-        raise ValueError(f"expected {triangle.shape[0]} columns, as in the rows before, found {count}")
+        raise ValueError(
+            f"expected {triangle.shape[0]} columns, as in the rows before, found {count}"
+        )
     if not count or not rows:
-        return np.zeros((count, count)) if triangle is None else triangle
-    out = np.zeros((count, count), order="F") if triangle is None else np.array(triangle, order="F")
+        if triangle is None:
+            return np.zeros((count, count))
+        return triangle
+    if triangle is None:
+        out = np.zeros((count, count), order="F")
+    else:
+        out = np.array(triangle, order="F")
     for first in range(0, rows, BLOCK_ROWS):
-        # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a transposition.
+        # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a
+        # transposition.
         block = np.array(columns[:, first : first + BLOCK_ROWS], order="C")
-        out = lapack.dtpqrt(0, min(REFLECTORS, count), out, block.T, overwrite_a=1, overwrite_b=1)[0]
+        out = lapack.dtpqrt(0, min(REFLECTORS, count), out, block.T, overwrite_a=1, overwrite_b=1)[
+            0
+        ]
     return np.triu(out)

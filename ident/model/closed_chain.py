@@ -1,16 +1,17 @@
 """Motion of a closed chain: how the passive joints follow the motors.
 
-Every loop is cut, so that a tree with n joints remains, and closed again by φ(q) = 0 (`ident.model.robot.Closure`).
-With J = ∂φ/∂q, d = n − rank J coordinates x move independently, and
+Every loop is cut, so that a tree with n joints remains, and closed again by φ(q) = 0
+(`ident.model.robot.Closure`). With J = ∂φ/∂q, d = n − rank J coordinates x move independently, and
 
     q̇ = G ẋ,    J G = 0,    q̇_a = A ẋ,    q̈ = G ẍ + h,    J h = −J̇ q̇  (h zero in the rows of x).
 
-x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x in the others. With
-as many motors as degrees of freedom (m = d), x are the motors' joints, and A = I. A robot without closures has G = A =
-I. (Briot & Gautier, Multibody System Dynamics 2015, eqs. of the tree and its closure; Khalil & Dombre, Modeling,
-Identification and Control of Robots, ch. 7.)
+x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x
+in the others. With as many motors as degrees of freedom (m = d), x are the motors' joints, and A =
+I. A robot without closures has G = A = I. (Briot & Gautier, Multibody System Dynamics 2015, eqs. of
+the tree and its closure; Khalil & Dombre, Modeling, Identification and Control of Robots, ch. 7.)
 
-Rows of φ that are lengths are divided by the size of the robot: a condition number then compares like with like.
+Rows of φ that are lengths are divided by the size of the robot: a condition number then compares
+like with like.
 """
 
 from __future__ import annotations
@@ -25,18 +26,25 @@ from ident.model.closures import loops, origin
 from ident.model.robot import JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
-"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow, and of A for a redundant drive;
-mechanisms stay below 30 in their workspace."""
+"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow,
+and of A for a redundant drive; mechanisms stay below 30 in their workspace.
+"""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
-NEARLY_CLOSED = 1e-4  #: The same on the way to other positions: one more step of Newton leaves its square
+#: The same on the way to other positions: one more step of Newton leaves its square
+NEARLY_CLOSED = 1e-4
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
 LARGEST_MISFIT = 0.02
-"""Largest difference between a measured position of a redundant drive's motor and the pose that fits all of them best
-[rad, or m divided by the robot's size]: a bent arm stays below it, a wrong zero or sign does not."""
+"""Largest difference between a measured position of a redundant drive's motor and the pose that
+fits all of them best [rad, or m divided by the robot's size]: a bent arm stays below it, a wrong
+zero or sign does not.
+"""
 LONGEST_STRIDE = 64
-"""At least every 64th sample is reached from the assembly pose; the others start from their neighbours."""
-STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
+"""At least every 64th sample is reached from the assembly pose;
+the others start from their neighbours.
+"""
+#: Largest motion between two such samples [rad, or m divided by the robot's size]
+STRIDE_RAD = 0.25
 STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
 LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
@@ -44,7 +52,9 @@ MAX_ITERATIONS = 30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembly:
-    """Joints of a robot that its closures leave free, and those that follow, found at its assembly pose."""
+    """Joints of a robot that its closures leave free, and those that follow,
+    found at its assembly pose.
+    """
 
     position_rad: FloatArray  #: of all joints, closed exactly, shape (n,)
     independent: tuple[int, ...]  #: joints that are x, d of them
@@ -76,12 +86,15 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
         mobility: d as its maker declares it; not checked when None.
 
     Raises:
-        ModelError: a closure names no direction or cannot close there, the mobility is another one, the motors do not
-            move every degree of freedom, or the pose is singular.
+        ModelError: a closure names no direction or cannot close there, the mobility is another one,
+            the motors do not move every degree of freedom, or the pose is singular.
     """
     count = robot.joint_count
     everything = tuple(range(count))
-    start = np.zeros(count) if robot.assembly_rad is None else np.asarray(robot.assembly_rad, dtype=np.float64)
+    if robot.assembly_rad is None:
+        start = np.zeros(count)
+    else:
+        start = np.asarray(robot.assembly_rad, dtype=np.float64)
     if not robot.closures:
         return Assembly(start, everything, (), _size(robot, start), 1.0)
     _check(robot, start)
@@ -92,7 +105,8 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     found = free.shape[1]
     if mobility is not None and found != mobility:
         raise ModelError(
-            f"the closures leave {found} degrees of freedom at the assembly pose; expected {mobility} as declared: "
+            f"the closures leave {found} degrees of freedom at the assembly pose; expected "
+            f"{mobility} as declared: "
             "is a closure missing, or does one hold a direction that must be free (`directions`)?"
         )
     motors = list(robot.axis_joints)
@@ -101,19 +115,28 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     if len(motors) < found or np.linalg.matrix_rank(driven, tol=1e-6) < found:
         if len(motors) >= found and _generic_rank(robot, position, free, size_m) == found:
             raise ModelError(
-                f"the robot is singular at the assembly pose: there the motors {names} do not move all of its {found} "
+                f"the robot is singular at the assembly pose: there the motors {names} do not move "
+                f"all of its {found} "
                 "degrees of freedom, beside it they do; give an assembly pose inside the workspace"
             )
         raise ModelError(
-            f"the motors {names} do not move all {found} degrees of freedom that the closures leave; name a joint that "
+            f"the motors {names} do not move all {found} degrees of freedom that the closures "
+            "leave; name a joint that "
             "each motor drives, one for each degree of freedom at least (`motors`)"
         )
-    independent = tuple(motors) if len(motors) == found else _independent(free)
+    if len(motors) == found:
+        independent = tuple(motors)
+    else:
+        independent = _independent(free)
     dependent = tuple(joint for joint in everything if joint not in independent)
-    condition = float(_condition(np.linalg.qr(jacobian[None, :, dependent]).R)[0]) if dependent else 1.0
+    if dependent:
+        condition = float(_condition(np.linalg.qr(jacobian[None, :, dependent]).R)[0])
+    else:
+        condition = 1.0
     if condition > LARGEST_CONDITION:
         raise ModelError(
-            f"the assembly pose is close to a singularity: condition {condition:.3g} of the closures; expected below "
+            f"the assembly pose is close to a singularity: condition {condition:.3g} of the "
+            "closures; expected below "
             f"{LARGEST_CONDITION:g}: give a pose inside the workspace"
         )
     return Assembly(position, independent, dependent, size_m, condition)
@@ -122,23 +145,29 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
 def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     """Let all joints follow the motors' joints.
 
-    Of the several poses that belong to a position of the motors, it is the one that is reached from the assembly pose
-    by moving them there in a straight line: a function of the position alone, whatever was asked before. Samples
-    between two such poses start from an interpolation, which leads to the same pose.
+    Of the several poses that belong to a position of the motors, it is the one that is reached from
+    the assembly pose by moving them there in a straight line: a function of the position alone,
+    whatever was asked before. Samples between two such poses start from an interpolation, which
+    leads to the same pose.
 
     Args:
         robot: with n joints and m motors.
         assembly: of the robot.
-        axes: motion of the motors' joints, arrays of shape (k, m). A redundantly driven robot (m > d) gets the pose
-            that fits them best.
+        axes: motion of the motors' joints, arrays of shape (k, m). A redundantly driven robot (m >
+            d) gets the pose that fits them best.
 
     Raises:
-        ModelError: the loops cannot be closed at a position, the positions of a redundant drive's motors do not fit
-            each other, or it is close to a singularity, where small errors of position are large forces.
+        ModelError: the loops cannot be closed at a position, the positions of a redundant drive's
+            motors do not fit each other, or it is close to a singularity, where small errors of
+            position are large forces.
     """
-    motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
+    motors = list(robot.axis_joints)
+    x = list(assembly.independent)
+    rest = list(assembly.dependent)
     measured = np.asarray(axes.position_rad, dtype=np.float64)
-    samples, count, d = len(measured), robot.joint_count, len(x)
+    samples = len(measured)
+    count = robot.joint_count
+    d = len(x)
     if not robot.closures:
         one = np.broadcast_to(np.eye(count), (samples, count, count))
         return TreeMotion(axes, one, one, np.ones(samples))
@@ -154,15 +183,22 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     bias = np.zeros((samples, count))
     turning = loops(robot, position, assembly.size_m, velocity).bias
     bias[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, turning)[..., None])[..., 0]
-    acceleration_x = _least_squares(to_motors, np.asarray(axes.acceleration_rad_s2) - bias[:, motors])
+    acceleration_x = _least_squares(
+        to_motors, np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
+    )
     acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias
     condition = _condition(r)
-    for of, values in (("closures", condition), ("motors", _condition_of_motors(robot, assembly, to_motors))):
+    for of, values in (
+        ("closures", condition),
+        ("motors", _condition_of_motors(robot, assembly, to_motors)),
+    ):
         worst = int(np.argmax(values))
         if values[worst] > LARGEST_CONDITION:
             raise ModelError(
-                f"the motion comes close to a singularity at {_at(robot, measured[worst])}: condition "
-                f"{values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record moves away from it"
+                f"the motion comes close to a singularity at {_at(robot, measured[worst])}: "
+                "condition "
+                f"{values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record "
+                "moves away from it"
             )
     return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
 
@@ -171,10 +207,11 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
 class Reach:
     """Poses that belong to positions of the motors' joints, where there are any."""
 
-    position_rad: FloatArray  #: of all joints; where the loops do not close, of some pose near by, shape (k, n)
+    #: of all joints; where the loops do not close, of some pose near by, shape (k, n)
+    position_rad: FloatArray
     gap: FloatArray  #: |φ| that is left, in units of the robot's size or radians, shape (k,)
-    #: Largest difference between a motor's position and that of its joint [rad or m], shape (k,): not zero where motors
-    #: of a redundant drive do not fit each other.
+    #: Largest difference between a motor's position and that of its joint [rad or m], shape (k,):
+    #: not zero where motors of a redundant drive do not fit each other.
     misfit: FloatArray
     condition: FloatArray  #: of J_d by the Frobenius norm, shape (k,)
 
@@ -185,33 +222,43 @@ class Reach:
 
 
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k, m); see `follow`.
+    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k,
+    m); see `follow`.
 
     Raises:
-        ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not fit each other.
+        ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not
+            fit each other.
     """
     found = reach(robot, assembly, axes_rad)
     units = _units(robot, assembly)
-    apart = np.abs(found.position_rad[:, list(robot.axis_joints)] - axes_rad) / units  # zero where m = d
+    # Zero where m = d
+    apart = np.abs(found.position_rad[:, list(robot.axis_joints)] - axes_rad) / units
     worst, axis = divmod(int(np.argmax(apart)), apart.shape[1])
     if apart[worst, axis] > LARGEST_MISFIT:
         raise ModelError(
-            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: {robot.axes[axis].name} is "
-            f"{apart[worst, axis] * units[axis]:.2g} away from where the others hold it; expected at most "
-            f"{LARGEST_MISFIT * units[axis]:.2g} (rad or m): are signs, zeros and ratios of the axes right?"
+            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: "
+            f"{robot.axes[axis].name} is "
+            f"{apart[worst, axis] * units[axis]:.2g} away from where the others hold it; "
+            "expected at most "
+            f"{LARGEST_MISFIT * units[axis]:.2g} (rad or m): are signs, zeros and ratios of the "
+            "axes right?"
         )
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
         raise ModelError(
-            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} of the robot's size "
-            "is left open; expected positions inside the workspace: are signs, zeros and units of the axes right?"
+            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} "
+            "of the robot's size "
+            "is left open; expected positions inside the workspace: are signs, zeros and units of "
+            "the axes right?"
         )
     return found.position_rad
 
 
 def _units(robot: Robot, assembly: Assembly) -> FloatArray:
     """A radian, or the robot's size, of each motor's joint, shape (m,)."""
-    return np.array([1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes])
+    return np.array(
+        [1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes]
+    )
 
 
 def _condition(triangle: FloatArray) -> FloatArray:
@@ -221,7 +268,9 @@ def _condition(triangle: FloatArray) -> FloatArray:
 
 
 def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray) -> FloatArray:
-    """Condition of A in each sample, shape (k,): where it is large, motors hardly move some of the coordinates x."""
+    """Condition of A in each sample, shape (k,):
+    where it is large, motors hardly move some of the coordinates x.
+    """
     if robot.axis_count == assembly.mobility:
         return np.ones(len(to_motors))
     kinds = [robot.joints[joint].kind for joint in assembly.independent]
@@ -236,8 +285,11 @@ def _at(robot: Robot, axes_rad: FloatArray) -> str:
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
-    """Close the loops at positions of the motors' joints [rad or m], shape (k, m), as far as they close."""
-    samples, motors = len(axes_rad), list(robot.axis_joints)
+    """Close the loops at positions of the motors' joints [rad or m], shape (k, m),
+    as far as they close.
+    """
+    samples = len(axes_rad)
+    motors = list(robot.axis_joints)
     if not robot.closures:
         return Reach(axes_rad, np.zeros(samples), np.zeros(samples), np.ones(samples))
     start = assembly.position_rad[motors]
@@ -247,7 +299,8 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     coarse = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
     steps = int(np.ceil(np.max(np.abs(axes_rad[coarse] - start) / units, initial=0.0) / STEP_RAD))
     found = np.tile(assembly.position_rad, (len(coarse), 1))
-    gap, condition = np.zeros(len(coarse)), np.full(len(coarse), assembly.condition)
+    gap = np.zeros(len(coarse))
+    condition = np.full(len(coarse), assembly.condition)
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
         way = start + (axes_rad[coarse] - start) * (step / steps)
@@ -255,14 +308,20 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
-        near = _between(coarse, found, finer) if len(coarse) > 1 else np.repeat(found, len(finer), axis=0)
+        if len(coarse) > 1:
+            near = _between(coarse, found, finer)
+        else:
+            near = np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
     return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
 
 
-def reach_near(robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray) -> Reach:
-    """Close the loops from poses near by, as those of the same robot with slightly other lengths or zeros.
+def reach_near(
+    robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray
+) -> Reach:
+    """Close the loops from poses near by, as those of the same robot with slightly other lengths or
+    zeros.
 
     Args:
         robot: whose loops are closed.
@@ -276,14 +335,27 @@ def reach_near(robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad:
 
 
 def _newton(
-    robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, *, on_the_way: bool = False
+    robot: Robot,
+    assembly: Assembly,
+    position: FloatArray,
+    axes_rad: FloatArray,
+    *,
+    on_the_way: bool = False,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Close the loops at given positions of the motors' joints, from near by: positions, gaps and conditions.
+    """Close the loops at given positions of the motors' joints, from near by:
+    positions, gaps and conditions.
 
     ``on_the_way`` to other positions it is enough to stay near the pose.
     """
-    closed, settled_rad = (NEARLY_CLOSED, 1e-3) if on_the_way else (CLOSED, 1e-9)
-    motors, x, rest = list(robot.axis_joints), list(assembly.independent), list(assembly.dependent)
+    if on_the_way:
+        closed = NEARLY_CLOSED
+        settled_rad = 1e-3
+    else:
+        closed = CLOSED
+        settled_rad = 1e-9
+    motors = list(robot.axis_joints)
+    x = list(assembly.independent)
+    rest = list(assembly.dependent)
     position = position.copy()
     redundant = len(motors) > len(x)
     if not redundant:
@@ -302,7 +374,8 @@ def _newton(
             left = axes_rad - position[:, motors] - change[:, motors]
             change += np.einsum("knd,kd->kn", to_joints, _least_squares(to_joints[:, motors], left))
         step = np.max(np.abs(change), axis=1)
-        lost = ~(step < LONGEST_STEP_RAD)  # where there is no pose, Newton's steps become longer and longer
+        # Where there is no pose, Newton's steps become longer and longer
+        lost = ~(step < LONGEST_STEP_RAD)
         change[lost] = 0.0
         position += change
         if np.all(lost | ((gap < closed) & (step < settled_rad))):
@@ -311,14 +384,18 @@ def _newton(
 
 
 def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
-    """Positions between known samples, shape (len(finer), n): cubic polynomials with the slopes of differences."""
+    """Positions between known samples, shape (len(finer), n):
+    cubic polynomials with the slopes of differences.
+    """
     slope = np.gradient(found, coarse, axis=0)
     before = np.clip(np.searchsorted(coarse, finer, side="right") - 1, 0, len(coarse) - 2)
     length = (coarse[before + 1] - coarse[before])[:, None]
     s = (finer - coarse[before])[:, None] / length
-    first, second = found[before], found[before + 1]
+    first = found[before]
+    second = found[before + 1]
     bend = first - second
-    a, b = slope[before] * length + bend, -slope[before + 1] * length - bend
+    a = slope[before] * length + bend
+    b = -slope[before + 1] * length - bend
     return np.asarray((1 - s) * first + s * second + s * (1 - s) * ((1 - s) * a + s * b))
 
 
@@ -329,7 +406,9 @@ def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:
     if not np.all(np.abs(diagonal) > tiny):
         triangle = triangle.copy()
         np.einsum("kii->ki", triangle)[np.abs(diagonal) <= tiny] = 1e-300
-    return np.asarray(np.linalg.solve(triangle, np.broadcast_to(right, (len(triangle), *right.shape[-2:]))))
+    return np.asarray(
+        np.linalg.solve(triangle, np.broadcast_to(right, (len(triangle), *right.shape[-2:])))
+    )
 
 
 def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
@@ -344,27 +423,37 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
             gap = float(np.max(np.abs(closing.residual)))
             if gap < CLOSED or not np.isfinite(gap):
                 break
-            position[moved] -= np.linalg.lstsq(closing.jacobian[0][:, moved], closing.residual[0], rcond=1e-8)[0]
+            position[moved] -= np.linalg.lstsq(
+                closing.jacobian[0][:, moved], closing.residual[0], rcond=1e-8
+            )[0]
         if gap < CLOSED and float(np.max(np.abs(position - start))) < np.pi:
             return position
     closing = loops(robot, start[None], size_m)
     ends = np.cumsum([len(closure.directions) for closure in robot.closures])
     parts = np.split(np.abs(closing.residual[0]), ends[:-1])
     worst = max(zip(robot.closures, parts, strict=True), key=lambda pair: float(pair[1].max()))
-    name, values = worst[0].name, ", ".join(map(_gap, worst[0].directions, worst[1] * size_m, worst[1]))
+    name = worst[0].name
+    values = ", ".join(map(_gap, worst[0].directions, worst[1] * size_m, worst[1]))
     raise ModelError(
-        f"closure {name!r} cannot close at the assembly pose: {values} apart where it is declared; expected a pose of "
-        "all joints at which the frames of every closure nearly coincide (assembly_deg, assembly_mm)"
+        f"closure {name!r} cannot close at the assembly pose: {values} apart where it is declared; "
+        "expected a pose of "
+        "all joints at which the frames of every closure nearly coincide (assembly_deg, "
+        "assembly_mm)"
     )
 
 
 def _gap(direction: str, length_m: float, angle_rad: float) -> str:
-    return f"{direction} {np.degrees(angle_rad):.3g}°" if "r" in direction else f"{direction} {1e3 * length_m:.3g} mm"
+    if "r" in direction:
+        return f"{direction} {np.degrees(angle_rad):.3g}°"
+    return f"{direction} {1e3 * length_m:.3g} mm"
 
 
 def _independent(free: FloatArray) -> tuple[int, ...]:
-    """Joints that move most independently of each other, by pivoted QR of the free motions, shape (n, d)."""
-    left, chosen = free.copy(), list[int]()
+    """Joints that move most independently of each other, by pivoted QR of the free motions,
+    shape (n, d).
+    """
+    left = free.copy()
+    chosen = list[int]()
     for _ in range(free.shape[1]):
         joint = int(np.argmax(np.linalg.norm(left, axis=1)))
         way = left[joint] / np.linalg.norm(left[joint])
@@ -396,22 +485,36 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
 
 def _check(robot: Robot, start: FloatArray) -> None:
     if start.shape != (robot.joint_count,):
-        raise ModelError(f"the assembly pose has shape {start.shape}; expected a position of each joint")
+        raise ModelError(
+            f"the assembly pose has shape {start.shape}; expected a position of each joint"
+        )
     if not robot.motors:
-        raise ModelError("a robot with closures needs the list of its motors' joints (`motors`); found none")
+        raise ModelError(
+            "a robot with closures needs the list of its motors' joints (`motors`); found none"
+        )
     if len(set(robot.motors)) < len(robot.motors):
-        twice = (robot.joints[joint].name for joint in sorted(set(robot.motors)) if robot.motors.count(joint) > 1)
-        raise ModelError(f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)")
+        twice = (
+            robot.joints[joint].name
+            for joint in sorted(set(robot.motors))
+            if robot.motors.count(joint) > 1
+        )
+        raise ModelError(
+            f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)"
+        )
     for joint, position in zip(robot.joints, start, strict=True):
-        # Poses are reached from the assembly pose in small steps, so a turn too many costs time in each of them.
+        # Poses are reached from the assembly pose in small steps, so a turn too many costs time in
+        # each of them.
         if joint.kind is JointKind.REVOLUTE and not abs(position) <= 2.0 * np.pi:
             raise ModelError(
-                f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected -360° to 360° "
+                f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected "
+                "-360° to 360° "
                 "(assembly_deg): whole turns change no pose"
             )
     for closure in robot.closures:
         if not closure.directions:
-            raise ModelError(f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz")
+            raise ModelError(
+                f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz"
+            )
 
 
 def _size(robot: Robot, position: FloatArray) -> float:

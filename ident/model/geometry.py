@@ -1,9 +1,11 @@
-"""What a description may have wrong of a closed chain: zeros of driven joints, lengths of links, places on the base.
+"""What a description may have wrong of a closed chain:
+zeros of driven joints, lengths of links, places on the base.
 
-A parameter is a number that the description gives; its change is what has to be added to that number. The zero of a
-joint is added to all of its recorded positions (`zero_offset_deg` of the cell file). A length is the distance from
-the origin of a link's joint to the next joint, or to the frame that closes a loop, along the described direction. A
-place is a coordinate of a joint's origin on the base.
+A parameter is a number that the description gives; its change is what has to be added to that
+number. The zero of a joint is added to all of its recorded positions (`zero_offset_deg` of the cell
+file). A length is the distance from the origin of a link's joint to the next joint, or to the frame
+that closes a loop, along the described direction. A place is a coordinate of a joint's origin on
+the base.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from ident.errors import ModelError
 from ident.model.robot import Closure, Joint, JointKind, Place, Robot, skew
 
 DIRECTIONS = ("x", "y", "z")  #: Axes of the base
-SHORTEST_LENGTH_M = 1e-6  #: Origins that are closer to each other have no direction along which to be wrong
+#: Origins that are closer to each other have no direction along which to be wrong
+SHORTEST_LENGTH_M = 1e-6
 
 
 class GeometryKind(Enum):
@@ -28,7 +31,8 @@ class GeometryKind(Enum):
     ZERO = "zero"  #: of a driven joint [rad; m of a prismatic joint]
     LENGTH = "length"  #: of a link, between two points of it [m]
     PLACE = "place"  #: coordinate of a joint on the base, in the axes of the base [m]
-    DELAY = "delay"  #: of a joint's encoder behind the others [s], which is no number of the description
+    #: of a joint's encoder behind the others [s], which is no number of the description
+    DELAY = "delay"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +40,11 @@ class GeometryParameter:
     """One number of a robot's description."""
 
     kind: GeometryKind
-    joint: str  #: name of the joint: the one with the zero, on the base, or late, or the one that moves the link
-    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x, y or z.
+    #: name of the joint: the one with the zero, on the base, or late, or the one that moves the
+    #: link
+    joint: str
+    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x,
+    #: y or z.
     end: str = ""
 
     @property
@@ -63,7 +70,8 @@ class GeometryChange:
 
 
 def geometry_parameters(robot: Robot) -> tuple[GeometryParameter, ...]:
-    """Return the zeros of all driven joints, in the order of the axes, then the lengths of all moving links.
+    """Return the zeros of all driven joints, in the order of the axes,
+    then the lengths of all moving links.
 
     Of a length of zero there is no direction, and the places of joints on the base are no lengths.
     """
@@ -74,22 +82,32 @@ def geometry_parameters(robot: Robot) -> tuple[GeometryParameter, ...]:
 def base_places(robot: Robot) -> tuple[GeometryParameter, ...]:
     """Return the coordinates of all joints on the base."""
     on_base = [joint.name for joint in robot.joints if joint.parent < 0]
-    return tuple(GeometryParameter(GeometryKind.PLACE, name, axis) for name in on_base for axis in DIRECTIONS)
+    found = []
+    for name in on_base:
+        for axis in DIRECTIONS:
+            found.append(GeometryParameter(GeometryKind.PLACE, name, axis))
+    return tuple(found)
 
 
 def encoder_delays(robot: Robot) -> tuple[GeometryParameter, ...]:
-    """Return the delays of the encoders, in the order of the axes; `with_geometry` knows none of them."""
+    """Return the delays of the encoders, in the order of the axes;
+    `with_geometry` knows none of them.
+    """
     return tuple(GeometryParameter(GeometryKind.DELAY, joint.name) for joint in robot.axes)
 
 
 def _lengths(robot: Robot) -> Iterator[GeometryParameter]:
     for joint in robot.joints:
         if joint.parent >= 0 and np.linalg.norm(joint.translation_m) > SHORTEST_LENGTH_M:
-            yield GeometryParameter(GeometryKind.LENGTH, robot.joints[joint.parent].name, joint.name)
+            yield GeometryParameter(
+                GeometryKind.LENGTH, robot.joints[joint.parent].name, joint.name
+            )
     for closure in robot.closures:
         for place in (closure.first, closure.second):
             if place.joint >= 0 and np.linalg.norm(place.translation_m) > SHORTEST_LENGTH_M:
-                yield GeometryParameter(GeometryKind.LENGTH, robot.joints[place.joint].name, closure.name)
+                yield GeometryParameter(
+                    GeometryKind.LENGTH, robot.joints[place.joint].name, closure.name
+                )
 
 
 def described_length(robot: Robot, parameter: GeometryParameter) -> float:
@@ -163,7 +181,9 @@ def _with_zero(robot: Robot, name: str, change: float) -> Robot:
     if joint.kind is JointKind.REVOLUTE:
         moved = replace(joint, rotation=joint.rotation @ _turn(joint.axis, change))
     else:
-        moved = replace(joint, translation_m=joint.translation_m + change * (joint.rotation @ joint.axis))
+        moved = replace(
+            joint, translation_m=joint.translation_m + change * (joint.rotation @ joint.axis)
+        )
     joints = (*robot.joints[:number], moved, *robot.joints[number + 1 :])
     pose = robot.assembly_rad
     if pose is not None:
@@ -175,15 +195,21 @@ def _with_zero(robot: Robot, name: str, change: float) -> Robot:
 def _turn(axis: FloatArray, angle_rad: float) -> FloatArray:
     """Rotation by an angle about a unit vector, shape (3, 3): Rodrigues' formula."""
     cross = skew(axis)
-    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * (cross @ cross))
+    return np.asarray(
+        np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * (cross @ cross)
+    )
 
 
 def _with_length(robot: Robot, parameter: GeometryParameter, change_m: float) -> Robot:
     joints = tuple(
-        _moved_joint(joint, change_m) if _is_end(robot, parameter, joint.parent, joint.name) else joint
+        _moved_joint(joint, change_m)
+        if _is_end(robot, parameter, joint.parent, joint.name)
+        else joint
         for joint in robot.joints
     )
-    closures = tuple(_moved_closure(robot, parameter, closure, change_m) for closure in robot.closures)
+    closures = tuple(
+        _moved_closure(robot, parameter, closure, change_m) for closure in robot.closures
+    )
     return replace(robot, joints=joints, closures=closures)
 
 
@@ -196,7 +222,9 @@ def _moved_joint(joint: Joint, change_m: float) -> Joint:
     return replace(joint, translation_m=_longer(joint.translation_m, change_m))
 
 
-def _moved_closure(robot: Robot, parameter: GeometryParameter, closure: Closure, change_m: float) -> Closure:
+def _moved_closure(
+    robot: Robot, parameter: GeometryParameter, closure: Closure, change_m: float
+) -> Closure:
     ends: list[Place] = []
     for place in (closure.first, closure.second):
         if _is_end(robot, parameter, place.joint, closure.name):

@@ -1,21 +1,22 @@
 """Joint torques as a linear function of the links' inertial parameters, for many samples at once.
 
-Motions are screws (w, u): angular part, and linear part at the origin of the frame in which they are written. Three
-kinds of them go from link to link by the same matrices, and therefore in one product: the velocity V = (ω, v), the
-acceleration A = (α, a′) and the screw S_j of every joint j that moves the link,
+Motions are screws (w, u): angular part, and linear part at the origin of the frame in which they
+are written. Three kinds of them go from link to link by the same matrices, and therefore in one
+product: the velocity V = (ω, v), the acceleration A = (α, a′) and the screw S_j of every joint j
+that moves the link,
 
     V_i = X V + S q̇,        A_i = X A + S q̈ + V × S q̇,        S_j,i = X S_j,        X = Σ_f f(q) X_f,
 
-with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a prismatic one. Gravity is
-a base acceleration of −g. With a = a′ + ω × v, the acceleration of the link frame's origin, Newton-Euler gives the
-wrench there,
+with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a
+prismatic one. Gravity is a base acceleration of −g. With a = a′ + ω × v, the acceleration of the
+link frame's origin, Newton-Euler gives the wrench there,
 
     n = I α + ω × (I ω) + h × a,        f = m a + α × h + ω × (ω × h),        h = m c,
 
-linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its screw, S_jᵀ Y (paper
-eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever computed; every operation is a plain product of
-arrays that are contiguous in time.
-"""
+linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its
+screw, S_jᵀ Y (paper eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever
+computed; every operation is a plain product of arrays that are contiguous in time.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import JointKind, Robot, skew
 
-BLOCK_SAMPLES = 4096  #: Samples computed at once: with fewer, most of the time goes into the calls of numpy
+#: Samples computed at once: with fewer, most of the time goes into the calls of numpy
+BLOCK_SAMPLES = 4096
 
 
 def fill_rigid(
@@ -37,14 +39,16 @@ def fill_rigid(
     out: FloatArray,
     wanted: BoolArray | None = None,
 ) -> None:
-    """Write the columns of the rigid links into an array of the caller, who may use it again for the next piece.
+    """Write the columns of the rigid links into an array of the caller,
+    who may use it again for the next piece.
 
     Args:
         robot: n joints.
-        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n, k), time last.
-        out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k): joint, link,
-            parameter, sample; a view into a wider layout will do. Only links that the joint moves are written, so that
-            the rest may be zeroed once and for all.
+        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n,
+            k), time last.
+        out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k):
+            joint, link, parameter, sample; a view into a wider layout will do. Only links that the
+            joint moves are written, so that the rest may be zeroed once and for all.
         wanted: parameters of each link that are written, shape (n, 10); all when None.
     """
     links = _links(robot)
@@ -58,12 +62,20 @@ def fill_rigid(
         if block.stop - first != size:
             work = _work(robot, links, block.stop - first)
         for index, link in enumerate(links):
-            _move(link, work, index, position[index, block], velocity[index, block], acceleration[index, block])
+            _move(
+                link,
+                work,
+                index,
+                position[index, block],
+                velocity[index, block],
+                acceleration[index, block],
+            )
             screws = work.screws[index]
             _fill_wrench(work.inertia, work.moments, screws[0], screws[1])
             for screw, mover in zip(screws[2:], link.movers, strict=True):
                 row = out[mover, index, :, block]
-                # Most joints turn or slide along an axis of their link's frame: their own row is one of Y's.
+                # Most joints turn or slide along an axis of their link's frame: their own row is
+                # one of Y's.
                 alone = link.component if mover == index else None
                 for part in inertias[index]:
                     if alone is None:
@@ -84,18 +96,27 @@ def _spans(wanted: BoolArray) -> list[slice]:
 
 
 def rigid_torque(
-    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, parameters: FloatArray
+    robot: Robot,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    parameters: FloatArray,
 ) -> FloatArray:
-    """Torque of the rigid links [Nm or N], shape (n, k): the columns of `fill_rigid` times ``parameters``, (n, 10)."""
+    """Torque of the rigid links [Nm or N], shape (n, k):
+    the columns of `fill_rigid` times ``parameters``, (n, 10).
+    """
     links, out = _links(robot), np.empty_like(position)
     inertias = [_inertia(own) for own in parameters]
     for first in range(0, position.shape[1], BLOCK_SAMPLES):
         block = slice(first, first + BLOCK_SAMPLES)
-        states = list(zip(position[:, block], velocity[:, block], acceleration[:, block], strict=True))
+        states = list(
+            zip(position[:, block], velocity[:, block], acceleration[:, block], strict=True)
+        )
         work = _work(robot, links, len(states[0][0]), movers=False)
         for index, link in enumerate(links):
             _move(link, work, index, *states[index])
-        wrenches = np.zeros((len(links) + 1, 6, len(states[0][0])))  # the last one is what the base bears
+        # The last one is what the base bears
+        wrenches = np.zeros((len(links) + 1, 6, len(states[0][0])))
         for own, screws, inertia in zip(wrenches, work.screws, inertias, strict=False):
             v, (momentum, own[:]) = screws[0], inertia @ screws
             _add_cross(own[:3], v[:3], momentum[:3])
@@ -108,7 +129,8 @@ def rigid_torque(
 
 
 def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Torque of the rigid links at joint i per unit of acceleration of joint j, Σ S_iᵀ M S_j over the links, (n, n, k).
+    """Torque of the rigid links at joint i per unit of acceleration of joint j,
+    Σ S_iᵀ M S_j over the links, (n, n, k).
 
     Args:
         robot: n joints.
@@ -124,7 +146,9 @@ def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> F
             _move(link, work, index, here[index], still, still)
             screws = work.screws[index][2:]
             part = out[:, :, first : first + BLOCK_SAMPLES]
-            part[np.ix_(link.movers, link.movers)] += np.einsum("idk,jdk->ijk", screws, inertia @ screws)
+            part[np.ix_(link.movers, link.movers)] += np.einsum(
+                "idk,jdk->ijk", screws, inertia @ screws
+            )
     return out
 
 
@@ -135,7 +159,9 @@ def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cosine and sine to the last digit of one, by the half-angle: numpy has a vector tangent, four times as fast."""
+    """Cosine and sine to the last digit of one, by the half-angle:
+    numpy has a vector tangent, four times as fast.
+    """
     tangent = np.tan(0.5 * angle)
     square = tangent * tangent
     share = 1.0 / (1.0 + square)
@@ -143,15 +169,22 @@ def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _inertia(parameters: FloatArray) -> FloatArray:
-    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS), shape (6, 6)."""
+    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS),
+    shape (6, 6).
+    """
     first, mass = skew(parameters[6:9]), parameters[9] * np.eye(3)
-    return np.block([[parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3), first], [-first, mass]])
+    return np.block(
+        [[parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3), first], [-first, mass]]
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Constants of a link. Its joint turns or slides along z of a frame of its own: there cos q and sin q, or q, touch
-    two components in three, and most robots' links have that frame already."""
+    """Constants of a link.
+
+    Its joint turns or slides along z of a frame of its own: there cos q and sin q, or q, touch two
+    components in three, and most robots' links have that frame already.
+    """
 
     parent: int
     movers: tuple[int, ...]
@@ -159,13 +192,15 @@ class _Link:
     fixed: FloatArray  #: from the parent's frame to the joint's at q = 0, shape (6, 6)
     back: FloatArray | None  #: from the joint's frame to the link's; None where they are the same
     own: FloatArray  #: S in the link's frame, shape (6,)
-    component: int | None  #: the only one that S has, where it is 1; None where S is no axis of the frame
+    #: the only one that S has, where it is 1; None where S is no axis of the frame
+    component: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Arrays that every block uses again: V, A and the movers' screws of each link, shape (2 + movers, 6, k) (the base
-    is the last), room for products, and Y."""
+    """Arrays that every block uses again: V, A and the movers' screws of each link,
+    shape (2 + movers, 6, k) (the base is the last), room for products, and Y.
+    """
 
     screws: tuple[FloatArray, ...]
     products: FloatArray
@@ -187,10 +222,14 @@ def _links(robot: Robot) -> tuple[_Link, ...]:
                 parent=joint.parent,
                 movers=(*(links[joint.parent].movers if joint.parent >= 0 else ()), index),
                 revolute=revolute,
-                fixed=_blocks(turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)),
+                fixed=_blocks(
+                    turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)
+                ),
                 back=None if (turn == np.eye(3)).all() else _blocks(turn.T),
                 own=own,
-                component=int(np.argmax(own)) if np.count_nonzero(own) == 1 and own.max() == 1.0 else None,
+                component=int(np.argmax(own))
+                if np.count_nonzero(own) == 1 and own.max() == 1.0
+                else None,
             )
         )
     return tuple(links)
@@ -207,7 +246,12 @@ def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool 
 
 
 def _move(
-    link: _Link, work: _Work, index: int, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
+    link: _Link,
+    work: _Work,
+    index: int,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
 ) -> None:
     """Carry the parent's screws to a link, through the frame of its joint."""
     before = work.screws[link.parent]
@@ -256,8 +300,11 @@ def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray
     return out
 
 
-def _fill_wrench(inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> None:
-    """Y, in two parts: the moment of unit inertias, shape (3, 6, k); moment and force of unit (h, m), shape (6, 4, k).
+def _fill_wrench(
+    inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> None:
+    """Y, in two parts: the moment of unit inertias, shape (3, 6, k);
+    moment and force of unit (h, m), shape (6, 4, k).
 
     What is zero in every motion is left as it is.
     """

@@ -26,7 +26,8 @@ class Joint:
     name: str  #: as in the URDF
     kind: JointKind  #: revolute or prismatic
     parent: int  #: index of the joint before it, -1 for the base
-    rotation: FloatArray  #: rotation of the joint frame in the parent's frame at position zero, (3, 3)
+    #: rotation of the joint frame in the parent's frame at position zero, (3, 3)
+    rotation: FloatArray
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
 
@@ -40,7 +41,8 @@ class Place:
     translation_m: FloatArray  #: its origin there, (3,)
 
 
-PIVOT = "pivot"  #: What the name of a closure follows in the name of the joint that the loop was cut at
+#: What the name of a closure follows in the name of the joint that the loop was cut at
+PIVOT = "pivot"
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Along and about the axes of the first frame of a closure."""
@@ -48,9 +50,11 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closure:
-    """A joint that closes a loop of the tree: two frames on two links that coincide in some directions.
+    """A joint that closes a loop of the tree:
+    two frames on two links that coincide in some directions.
 
-    A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x, y are enough.
+    A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x,
+    y are enough.
     """
 
     name: str  #: as the cell file has it
@@ -69,18 +73,25 @@ class Pivot:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a motor."""
+    """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a
+    motor.
+    """
 
     joints: tuple[Joint, ...]  #: depth first from the base
-    gravity_m_s2: FloatArray  #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    gravity_m_s2: FloatArray
     closures: tuple[Closure, ...] = ()  #: none of a serial robot
-    motors: tuple[int, ...] = ()  #: joint that each axis drives, in the order of the axes; empty: every joint is driven
-    #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
+    #: joint that each axis drives, in the order of the axes; empty: every joint is driven
+    motors: tuple[int, ...] = ()
+    #: Positions of all joints at which the closures hold: which of several ways of assembly is
+    #: meant. Shape (n,).
     assembly_rad: FloatArray | None = None
-    platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
+    #: frame of the link that carries the payload; None: that of the last joint
+    platform: Place | None = None
     #: Gravity before its direction was corrected, shape (3,); None where it was not.
     declared_gravity_m_s2: FloatArray | None = None
-    #: Joints at which loops are cut, without those in which friction is the same as in a joint of the tree.
+    #: Joints at which loops are cut, without those in which friction is the same as in a joint of
+    #: the tree.
     pivots: tuple[Pivot, ...] = ()
 
     @property
@@ -91,12 +102,16 @@ class Robot:
     @property
     def carrier(self) -> int:
         """Index of the joint whose link carries the payload."""
-        return self.joint_count - 1 if self.platform is None else self.platform.joint
+        if self.platform is None:
+            return self.joint_count - 1
+        return self.platform.joint
 
     @property
     def mounting_m(self) -> FloatArray:
         """Where the payload is mounted, in the frame of the joint that carries it, shape (3,)."""
-        return np.zeros(3) if self.platform is None else self.platform.translation_m
+        if self.platform is None:
+            return np.zeros(3)
+        return self.platform.translation_m
 
     @property
     def axis_joints(self) -> tuple[int, ...]:
@@ -115,7 +130,9 @@ class Robot:
 
     @property
     def places(self) -> tuple[Joint, ...]:
-        """Where an effect can act: the driven joints, those without a motor, and the pivots that loops are cut at."""
+        """Where an effect can act: the driven joints, those without a motor,
+        and the pivots that loops are cut at.
+        """
         passive = (self.joints[joint] for joint in self.passive_joints)
         return (*self.axes, *passive, *map(self._as_joint, self.pivots))
 
@@ -181,7 +198,9 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i."""
+    """Poses of n + 1 frames in the base frame over k samples;
+    frame 0 is the base, frame i + 1 moves with joint i.
+    """
 
     rotation: FloatArray  #: shape (n + 1, k, 3, 3)
     origin_m: FloatArray  #: shape (n + 1, k, 3)
@@ -203,18 +222,24 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
         parent = rotation[joint.parent + 1]
         np.add(origin[joint.parent + 1], parent @ joint.translation_m, out=origin[index + 1])
         if joint.kind is JointKind.PRISMATIC:
-            origin[index + 1] += position_rad[:, index, None] * (parent @ (joint.rotation @ joint.axis))
+            origin[index + 1] += position_rad[:, index, None] * (
+                parent @ (joint.rotation @ joint.axis)
+            )
         np.matmul(parent, own[index], out=rotation[index + 1])
     return Poses(rotation, origin)
 
 
 def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
-    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3): Rodrigues' formula for all joints at once."""
+    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3):
+    Rodrigues' formula for all joints at once.
+    """
     axes = np.array([joint.axis for joint in robot.joints])
     outer = axes[:, :, None] * axes[:, None]
     turns = np.stack((outer, np.eye(3) - outer, np.array([skew(axis) for axis in axes])), axis=1)
     turns = np.array([joint.rotation for joint in robot.joints])[:, None] @ turns
-    turned = position_rad.T * np.array([[joint.kind is JointKind.REVOLUTE] for joint in robot.joints])
+    turned = position_rad.T * np.array(
+        [[joint.kind is JointKind.REVOLUTE] for joint in robot.joints]
+    )
     factors = np.stack((np.ones_like(turned), np.cos(turned), np.sin(turned)), axis=2)
     return np.asarray((factors @ turns.reshape(-1, 3, 9)).reshape(*turned.shape, 3, 3))
 

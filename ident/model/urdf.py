@@ -1,8 +1,10 @@
-"""Reading a URDF: the joint tree for identification, bodies and effort limits for the planner and the prior.
+"""Reading a URDF: the joint tree for identification,
+bodies and effort limits for the planner and the prior.
 
-The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions, plugins). Joints are
-ordered and merged as Pinocchio does it, which the tests compare with: depth first, branches in the order of their
-joints' names, fixed joints merged into the moving joint before them.
+The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions,
+plugins). Joints are ordered and merged as Pinocchio does it, which the tests compare with: depth
+first, branches in the order of their joints' names, fixed joints merged into the moving joint
+before them.
 """
 
 from __future__ import annotations
@@ -22,12 +24,19 @@ from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robo
 
 HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
 LINKAGE = (
-    "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and `motors`, as of a "
-    "closed chain (of a parallelogram, the link behind it keeps the direction of the link before its leader: one "
-    "closure of the two links about the joints' axis); a gear or belt of another ratio between joints is not supported"
+    "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and "
+    "`motors`, as of a "
+    "closed chain (of a parallelogram, the link behind it keeps the direction of the link before "
+    "its leader: one "
+    "closure of the two links about the joints' axis); a gear or belt of another ratio between "
+    "joints is not supported"
 )
 """What to do about a joint that follows an axis."""
-XACRO_SPACES = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}", "{http://wiki.ros.org/xacro}")
+XACRO_SPACES = (
+    "{http://www.ros.org/wiki/xacro}",
+    "{http://ros.org/wiki/xacro}",
+    "{http://wiki.ros.org/xacro}",
+)
 """Namespaces of xacro, as its files name them."""
 XACRO_EXPRESSION = "${"
 UNBOUND_PREFIX = "unbound prefix"  #: Of the parser's message
@@ -39,7 +48,8 @@ class UrdfRobot:
     """The n moving joints of a URDF."""
 
     joints: tuple[Joint, ...]  #: their geometry, depth first from the base
-    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none is given.
+    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none
+    #: is given.
     bodies: tuple[Body, ...]
     effort_limit: FloatArray  #: [Nm or N], shape (n,); inf where none is given
     links: Mapping[str, Place]  #: frame of every link of the URDF, by name
@@ -55,7 +65,8 @@ class LinkPair:
     name: str  #: of the closure
     first: str  #: link
     second: str  #: link
-    directions: tuple[str, ...]  #: of ident.model.robot.DIRECTIONS, along and about the axes of the first link
+    #: of ident.model.robot.DIRECTIONS, along and about the axes of the first link
+    directions: tuple[str, ...]
 
 
 def robot_from_urdf(
@@ -74,14 +85,14 @@ def robot_from_urdf(
         gravity_m_s2: gravity in the base frame.
         closures: which links coincide; none of a serial robot.
         motors: joint of each axis of a closed chain, in the order of the axes.
-        assembly_rad: roughly, the position of every joint at which the closures hold [rad; m of a prismatic joint];
-            joints that are not named are at 0.
+        assembly_rad: roughly, the position of every joint at which the closures hold [rad; m of a
+            prismatic joint]; joints that are not named are at 0.
         platform: link that carries the payload; that of the last joint when None.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, one of more than one degree of freedom, or one that
-            mimics another (`hold_joints` fixes those of a gripper with their leader); a closure,
-            motor, assembly pose or platform names what it does not have.
+        ModelError: the text is no URDF, has no moving joint, one of more than one degree of
+            freedom, or one that mimics another (`hold_joints` fixes those of a gripper with their
+            leader); a closure, motor, assembly pose or platform names what it does not have.
     """
     found = read_urdf(urdf)
     for name, mimic in mimics_of(urdf).items():
@@ -91,25 +102,48 @@ def robot_from_urdf(
 
     def link(name: str, what: str) -> Place:
         if name not in found.links:
-            raise ModelError(f"{what} names link {name!r}; the URDF has the links {', '.join(sorted(found.links))}")
+            raise ModelError(
+                f"{what} names link {name!r}; the URDF has the links "
+                f"{', '.join(sorted(found.links))}"
+            )
         return found.links[name]
 
     for what, names in (("the list of motors", motors), ("the assembly pose", assembly_rad or {})):
         for name in names:
             if name not in index:
-                raise ModelError(f"{what} names joint {name!r}; the URDF has the moving joints {', '.join(index)}")
+                raise ModelError(
+                    f"{what} names joint {name!r}; the URDF has the moving joints "
+                    f"{', '.join(index)}"
+                )
     closed = []
     for pair in closures:
-        require_kind("an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)")
+        require_kind(
+            "an entry of closures",
+            pair,
+            LinkPair,
+            "write LinkPair(name, first, second, directions)",
+        )
         what = f"closure {pair.name!r}"
         unknown = [direction for direction in pair.directions if direction not in DIRECTIONS]
         if unknown or not pair.directions or len(set(pair.directions)) < len(pair.directions):
             given = ", ".join(pair.directions) or "none"
-            raise ModelError(f"{what} has the directions {given}; expected some of {', '.join(DIRECTIONS)}, each once")
-        closed.append(Closure(pair.name, link(pair.first, what), link(pair.second, what), tuple(pair.directions)))
-    carrier = None if platform is None else link(platform, "the platform")
+            raise ModelError(
+                f"{what} has the directions {given}; expected some of "
+                f"{', '.join(DIRECTIONS)}, each once"
+            )
+        closed.append(
+            Closure(
+                pair.name, link(pair.first, what), link(pair.second, what), tuple(pair.directions)
+            )
+        )
+    if platform is None:
+        carrier = None
+    else:
+        carrier = link(platform, "the platform")
     if carrier is not None and carrier.joint < 0:
-        raise ModelError(f"the platform {platform!r} does not move; expected the link that carries the payload")
+        raise ModelError(
+            f"the platform {platform!r} does not move; expected the link that carries the payload"
+        )
     pose = np.array([(assembly_rad or {}).get(joint.name, 0.0) for joint in found.joints])
     robot = Robot(
         joints=found.joints,
@@ -119,12 +153,16 @@ def robot_from_urdf(
         assembly_rad=pose if closed else None,
         platform=carrier,
     )
-    return replace(robot, pivots=cut_pivots(robot)) if closed else robot
+    if closed:
+        return replace(robot, pivots=cut_pivots(robot))
+    return robot
 
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """A joint that follows another one: q = multiplier · q_leader + offset, the `<mimic>` of a URDF."""
+    """A joint that follows another one:
+    q = multiplier · q_leader + offset, the `<mimic>` of a URDF.
+    """
 
     leader: str  #: name of the joint that it follows
     multiplier: float
@@ -137,22 +175,26 @@ class Mimic:
 
 
 def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
-    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's) are fixed.
+    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's)
+    are fixed.
 
     Args:
         urdf: text of the URDF.
-        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint that mimics a held
-            one, directly or through others, follows it. Joints of type floating and planar can only be held at 0.
+        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint
+            that mimics a held one, directly or through others, follows it. Joints of type floating
+            and planar can only be held at 0.
 
     Raises:
-        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there: it mimics one that
-            moves, or one by which it is elsewhere.
+        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held
+            there: it mimics one that moves, or one by which it is elsewhere.
     """
     robot = _root(urdf)
     movable = _movable(robot)
     for name in position_rad:
         if name not in movable:
-            raise ModelError(f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}")
+            raise ModelError(
+                f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}"
+            )
     mimics = _mimics(movable)
     followed = _followed(mimics, position_rad)
     for name, position in position_rad.items():
@@ -184,13 +226,17 @@ def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
         multiplier = _finite(mimic.get("multiplier", "1"))
         offset = _finite(mimic.get("offset", "0"))
         if multiplier is None or offset is None:
-            raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
+            raise ModelError(
+                f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number"
+            )
         found[name] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return found
 
 
 def _followed(mimics: Mapping[str, Mimic], position_rad: Mapping[str, float]) -> dict[str, float]:
-    """Return the position of every joint that follows held ones, through any number of others [rad or m]."""
+    """Return the position of every joint that follows held ones,
+    through any number of others [rad or m].
+    """
     followed: dict[str, float] = {}
     for _ in mimics:  # a chain is no longer than the number of its followers
         for name, mimic in mimics.items():
@@ -215,45 +261,54 @@ def _require_free(
     if elsewhere is not None:
         if not np.isclose(position, elsewhere, rtol=0.0, atol=HELD_ALIKE):
             raise ModelError(
-                f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by which it is at "
+                f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by "
+                "which it is at "
                 f"{elsewhere:g}; expected the same position [rad or m], or `hold` of one of the two"
             )
     elif mimic.leader in movable:
         raise ModelError(
-            f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), which moves: it follows "
+            f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), "
+            "which moves: it follows "
             f"and cannot be held; expected {LINKAGE}"
         )
 
 
 def _fix(element: Element, position: float) -> None:
     """Make a joint a fixed one whose origin is its pose at a position."""
-    name, kind = _name(element), element.get("type")
+    name = _name(element)
+    kind = element.get("type")
     rotation, translation = _origin(element, name)
     if kind not in ("floating", "planar"):
         joint = _joint(element, Place(-1, rotation, translation))
         placed = poses(Robot((joint,), np.zeros(3)), np.array([[position]]))
-        rotation, translation = placed.rotation[1, 0], placed.origin_m[1, 0]
+        rotation = placed.rotation[1, 0]
+        translation = placed.origin_m[1, 0]
     elif position != 0.0:
         raise ModelError(f"joint {name!r} is of type {kind!r} and held at {position:g}; expected 0")
     roll = atan2(rotation[2, 1], rotation[2, 2])
-    s, c = sin(roll), cos(roll)  # with this roll the other two are exact for every pitch, 90° included
+    # With this roll the other two are exact for every pitch, 90° included
+    s, c = sin(roll), cos(roll)
     pitch = atan2(-rotation[2, 0], s * rotation[2, 1] + c * rotation[2, 2])
     yaw = atan2(s * rotation[0, 2] - c * rotation[0, 1], c * rotation[1, 1] - s * rotation[1, 2])
     for child in [child for child in element if child.tag not in ("parent", "child")]:
         element.remove(child)
     element.set("type", "fixed")
     spelled = {"xyz": translation.tolist(), "rpy": [roll, pitch, yaw]}
-    element.append(Element("origin", {key: " ".join(map(repr, three)) for key, three in spelled.items()}))
+    element.append(
+        Element("origin", {key: " ".join(map(repr, three)) for key, three in spelled.items()})
+    )
 
 
 def read_urdf(urdf: str) -> UrdfRobot:
     """Read joints, bodies and effort limits of a URDF.
 
-    A link without a readable mass or centre of mass counts as massless, one without a readable inertia as a point mass:
-    they only guide the choice of moves, and a URDF for identification need not have them.
+    A link without a readable mass or centre of mass counts as massless, one without a readable
+    inertia as a point mass: they only guide the choice of moves, and a URDF for identification need
+    not have them.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of freedom.
+        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of
+            freedom.
     """
     links, joints_behind, root = _tree(urdf)
     places = {root: Place(-1, np.eye(3), np.zeros(3))}
@@ -265,7 +320,11 @@ def read_urdf(urdf: str) -> UrdfRobot:
         before, element = pending.pop()
         link = _link_at(element, "child")
         rotation, translation = _origin(element, _name(element))
-        here = Place(before.joint, before.rotation @ rotation, before.translation_m + before.rotation @ translation)
+        here = Place(
+            before.joint,
+            before.rotation @ rotation,
+            before.translation_m + before.rotation @ translation,
+        )
         if element.get("type") != "fixed":
             joints.append(_joint(element, here))
             bodies.append(_body(links[link]))
@@ -276,11 +335,14 @@ def read_urdf(urdf: str) -> UrdfRobot:
         places[link] = here
         pending += [(here, behind) for behind in joints_behind[link]]
     if not joints:
-        raise ModelError("the URDF has no moving joint; expected at least one revolute or prismatic joint")
+        raise ModelError(
+            "the URDF has no moving joint; expected at least one revolute or prismatic joint"
+        )
     return UrdfRobot(tuple(joints), tuple(bodies), np.array(effort_limit), places)
 
 
-LONGEST_NAME = 255  #: Characters of a path in the place of a text; a longer one is not repeated in a message
+#: Characters of a path in the place of a text; a longer one is not repeated in a message
+LONGEST_NAME = 255
 
 
 def _root(urdf: str) -> Element:
@@ -290,22 +352,31 @@ def _root(urdf: str) -> Element:
     except (ParseError, TypeError) as error:
         if UNBOUND_PREFIX in str(error):
             raise ModelError(
-                f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not declared; expected "
-                'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: is expanded by '
+                f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not "
+                "declared; expected "
+                'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: '
+                "is expanded by "
                 "`xacro robot.urdf.xacro > robot.urdf`"
             ) from error
         text = str(urdf)
         if text.strip() and len(text) <= LONGEST_NAME and "<" not in text and "\n" not in text:
-            raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
+            raise ModelError(
+                f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()"
+            ) from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")
     if robot.tag != space + "robot" or (space and not space.startswith("{")):
-        raise ModelError(f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>")
+        raise ModelError(
+            f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>"
+        )
     if robot.get("version", "1.0") not in ("1.0", "1.1"):
         raise ModelError(f"the URDF is of version {robot.get('version')}; expected 1.0 or 1.1")
     _require_expanded(robot)
     for element in robot.iter():
-        element.tag = element.tag.removeprefix(space) if isinstance(element.tag, str) else ""
+        if isinstance(element.tag, str):
+            element.tag = element.tag.removeprefix(space)
+        else:
+            element.tag = ""
     return robot
 
 
@@ -316,7 +387,10 @@ def _require_expanded(robot: Element) -> None:
         is_macro = tag.startswith(XACRO_SPACES)
         has_expression = any(XACRO_EXPRESSION in value for value in element.attrib.values())
         if is_macro or has_expression:
-            name = f"<xacro:{tag.rpartition('}')[2]}>" if is_macro else f"{XACRO_EXPRESSION}...}} in <{tag}>"
+            if is_macro:
+                name = f"<xacro:{tag.rpartition('}')[2]}>"
+            else:
+                name = f"{XACRO_EXPRESSION}...}} in <{tag}>"
             raise ModelError(
                 f"the file is xacro that is not expanded (it has {name}); expected the output of "
                 "`xacro robot.urdf.xacro > robot.urdf`"
@@ -324,7 +398,9 @@ def _require_expanded(robot: Element) -> None:
 
 
 def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
-    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
+    """Return the links, the joints behind each (last name first, to be popped),
+    and the link without a parent.
+    """
     robot = _root(urdf)
     links = {_name(link): link for link in robot.findall("link")}
     joints = {_name(joint): joint for joint in robot.findall("joint")}
@@ -337,37 +413,54 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
         parent, child = (_link_at(joints[name], end) for end in ("parent", "child"))
         if parent not in links or child not in links:
             unknown = child if parent in links else parent
-            raise ModelError(f"joint {name!r} connects link {unknown!r}, which the URDF does not have")
+            raise ModelError(
+                f"joint {name!r} connects link {unknown!r}, which the URDF does not have"
+            )
         if child in children:
             raise ModelError(f"link {child!r} is the child of two joints; expected a tree")
         children.add(child)
         behind[parent].append(joints[name])
     if not links:
-        raise ModelError("the URDF has no <link>; expected the links of an arm, and the joints between them")
+        raise ModelError(
+            "the URDF has no <link>; expected the links of an arm, and the joints between them"
+        )
     roots = [name for name in links if name not in children]
     if not roots:
-        raise ModelError("every link of the URDF is behind a joint; expected a tree, with one link that is the base")
+        raise ModelError(
+            "every link of the URDF is behind a joint; expected a tree, with one link "
+            "that is the base"
+        )
     if len(roots) != 1:
         raise ModelError(
-            f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected one, the base"
+            f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected "
+            "one, the base"
         )
     return links, behind, roots[0]
 
 
 def _joint(element: Element, at: Place) -> Joint:
-    name, kind = _name(element), element.get("type")
+    name = _name(element)
+    kind = element.get("type")
     if kind not in ("revolute", "continuous", "prismatic"):
-        raise ModelError(f"joint {name!r} is of type {kind!r}; expected revolute, continuous, prismatic or fixed")
+        raise ModelError(
+            f"joint {name!r} is of type {kind!r}; expected revolute, continuous, prismatic or fixed"
+        )
     declared = element.find("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if declared is None else _vector(declared, "xyz", name)
+    if declared is None:
+        axis = np.array([1.0, 0.0, 0.0])
+    else:
+        axis = _vector(declared, "xyz", name)
     length = float(np.linalg.norm(axis))
     axis = axis / length if length > 0.0 else axis
     if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
-        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
+        raise ModelError(
+            f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one"
+        )
     distance = float(np.max(np.abs(at.translation_m)))
     if not distance <= LARGEST_DISTANCE_M:
         raise ModelError(
-            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
+            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most "
+            f"{LARGEST_DISTANCE_M:g} m: "
             "is the URDF in mm?"
         )
     return Joint(
@@ -381,12 +474,16 @@ def _joint(element: Element, at: Place) -> Joint:
 
 
 def _effort_limit(element: Element) -> float:
-    """Effort limit of a moving joint; the limit element must be complete, and only a continuous joint may lack it."""
+    """Effort limit of a moving joint; the limit element must be complete,
+    and only a continuous joint may lack it.
+    """
     limit = element.find("limit")
     if limit is None:
         if element.get("type") == "continuous":
             return inf
-        raise ModelError(f"joint {_name(element)!r} has no <limit>; expected one with effort and velocity")
+        raise ModelError(
+            f"joint {_name(element)!r} has no <limit>; expected one with effort and velocity"
+        )
     _number(limit, "velocity", _name(element))
     return _number(limit, "effort", _name(element))
 
@@ -405,10 +502,14 @@ def _body(link: Element) -> Body:
         return nothing
     try:
         tensor = _part(inertial, "inertia", name)
-        xx, xy, xz, yy, yz, zz = (_number(tensor, entry, name) for entry in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+        xx, xy, xz, yy, yz, zz = (
+            _number(tensor, entry, name) for entry in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
     except ModelError:
         return Body(mass, centre, np.zeros((3, 3)))
-    return Body(mass, centre, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T)
+    return Body(
+        mass, centre, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
+    )
 
 
 def _placed(body: Body, at: Place) -> Body:
@@ -424,23 +525,34 @@ def _joined(first: Body, second: Body) -> Body:
         return Body(0.0, np.zeros(3), first.inertia_kg_m2 + second.inertia_kg_m2)
     centre = (first.mass_kg * first.centre_m + second.mass_kg * second.centre_m) / mass
     apart = first.centre_m - second.centre_m
-    steiner = first.mass_kg * second.mass_kg / mass * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+    steiner = (
+        first.mass_kg * second.mass_kg / mass * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+    )
     return Body(mass, centre, first.inertia_kg_m2 + second.inertia_kg_m2 + steiner)
 
 
 def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
-    """Rotation and translation of an <origin>; the angles are about the fixed axes x, y, z, in this order."""
+    """Rotation and translation of an <origin>;
+    the angles are about the fixed axes x, y, z, in this order.
+    """
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
     if "quat_xyzw" in origin.attrib:
-        raise ModelError(f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy")
+        raise ModelError(
+            f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy"
+        )
     half = 0.5 * _vector(origin, "rpy", name)
     (cx, cy, cz), (sx, sy, sz) = map(cos, half), map(sin, half)
-    x, y, z = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz, cx * cy * sz - sx * sy * cz
+    x = sx * cy * cz - cx * sy * sz
+    y = cx * sy * cz + sx * cy * sz
+    z = cx * cy * sz - sx * sy * cz
     w = cx * cy * cz + sx * sy * sz
     length = sqrt(x * x + y * y + z * z + w * w)
-    x, y, z, w = x / length, y / length, z / length, w / length
+    x = x / length
+    y = y / length
+    z = z / length
+    w = w / length
     rotation = [
         [1.0 - (2.0 * y * y + 2.0 * z * z), 2.0 * y * x - 2.0 * z * w, 2.0 * z * x + 2.0 * y * w],
         [2.0 * y * x + 2.0 * z * w, 1.0 - (2.0 * x * x + 2.0 * z * z), 2.0 * z * y - 2.0 * x * w],
@@ -452,7 +564,9 @@ def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
 def _name(element: Element) -> str:
     name = element.get("name", "")
     if not name:
-        raise ModelError(f"a {element.tag} of the URDF has no name; expected one for each link and joint")
+        raise ModelError(
+            f"a {element.tag} of the URDF has no name; expected one for each link and joint"
+        )
     return name
 
 
@@ -473,7 +587,9 @@ def _vector(element: Element, key: str, name: str) -> FloatArray:
     text = element.get(key, "0 0 0")
     numbers = [_finite(word) for word in text.split()]
     if len(numbers) != 3 or None in numbers:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers")
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers"
+        )
     return np.array(numbers, dtype=np.float64)
 
 
@@ -481,7 +597,9 @@ def _number(element: Element, key: str, name: str) -> float:
     text = element.get(key, "")
     number = _finite(text)
     if number is None:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected a number")
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected a number"
+        )
     return number
 
 

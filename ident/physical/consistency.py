@@ -1,4 +1,6 @@
-"""What makes standard parameters those of a robot that can exist, as constraints of a semidefinite programme."""
+"""What makes standard parameters those of a robot that can exist,
+as constraints of a semidefinite programme.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,13 @@ from ident.errors import IdentificationError
 from ident.model.bodies import pseudo_inertia
 from ident.model.model import JOINT_COLUMNS, Model
 
-MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
-_ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
+#: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
+MARGIN = 1e-4
+_ATTEMPTS: tuple[dict[str, bool | float], ...] = (
+    {},
+    {"equilibrate_enable": False},
+    {"max_step_fraction": 0.9},
+)
 """Settings of Clarabel, tried in turn: some programmes end in a numerical error with the first."""
 
 
@@ -32,24 +39,28 @@ class NotPhysical(IdentificationError):
 class Consistency:
     """Conditions on n links and on the s parameters that are no link's.
 
-    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry friction fs and fsm,
-    and the own parameters of motors that turn with several joints (Iam, fvm), are not negative; the kinetic energy of
-    the rotors and the power lost to viscous friction are not negative in any motion, that is
+    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry
+    friction fs and fsm, and the own parameters of motors that turn with several joints (Iam, fvm),
+    are not negative; the kinetic energy of the rotors and the power lost to viscous friction are
+    not negative in any motion, that is
 
-        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq. 25),
+        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0
 
-    which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free.
+    and the same with fv and fvm (paper eq. 25), which without coupled motors is Ia ≥ 0 and fv ≥ 0.
+    Offsets are free.
     """
 
     link_columns: IntArray  #: indices of each link's ten parameters, shape (n, 10)
     scalars: IntArray  #: indices of the other parameters, shape (s,)
     scales: FloatArray  #: size of each of these, which the programme takes for one, shape (s,)
     positive: tuple[int, ...]  #: parameters that may not be negative
-    #: For each set of motors that turn with the same joints: parameters, and the contribution of each to the symmetric
-    #: matrix that must be positive semidefinite, shape (p, k, k).
+    #: For each set of motors that turn with the same joints: parameters, and the contribution of
+    #: each to the symmetric matrix that must be positive semidefinite, shape (p, k, k).
     dissipative: tuple[tuple[tuple[int, ...], FloatArray], ...]
 
-    def constraints(self, cp: Any, links: Sequence[Any], scalars: Any, margin: float, room: float) -> list[Any]:
+    def constraints(
+        self, cp: Any, links: Sequence[Any], scalars: Any, margin: float, room: float
+    ) -> list[Any]:
         """Constraints on the links relative to their priors, and on the scaled other parameters.
 
         Args:
@@ -94,14 +105,16 @@ class Consistency:
         return True
 
 
-def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[int] = frozenset()) -> Consistency:
+def consistency_of(
+    model: Model, scales: FloatArray, other_friction: frozenset[int] = frozenset()
+) -> Consistency:
     """Conditions for a model's standard parameters.
 
     Args:
         model: the declared model.
         scales: size of each parameter that is no link's, in their order, shape (s,).
-        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
-            sign.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv
+            alone may have any sign.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     link_columns = model.link_columns
@@ -111,18 +124,28 @@ def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[i
     own_friction = [axis for axis in range(model.robot.axis_count) if axis not in other_friction]
     positive = [index[f"fs{number_of[axis]}"] for axis in own_friction]
     positive += [index[f"Iam{motor + 1}"] for motor in coupled]
-    positive += [index[f"{name}{motor + 1}"] for motor in coupled if motor in own_friction for name in ("fvm", "fsm")]
+    positive += [
+        index[f"{name}{motor + 1}"]
+        for motor in coupled
+        if motor in own_friction
+        for name in ("fvm", "fsm")
+    ]
     dissipative = []
     for axes in _turned_together(model):
-        motors = [motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])]
+        motors = [
+            motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])
+        ]
         for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
             if single == "fv" and other_friction.intersection(axes):
                 continue
-            names = [f"{single}{number_of[axis]}" for axis in axes] + [f"{shared}{motor + 1}" for motor in motors]
+            names = [f"{single}{number_of[axis]}" for axis in axes] + [
+                f"{shared}{motor + 1}" for motor in motors
+            ]
             if len(axes) == 1:
                 positive.append(index[names[0]])
             else:
-                # Contribution of each axis', then each motor's parameter to the matrix over these axes, (p, k, k).
+                # Contribution of each axis', then each motor's parameter to the matrix over these
+                # axes, (p, k, k).
                 turned = [model.drive_train.direction[motor, list(axes)] for motor in motors]
                 shares = [np.diag(unit) for unit in np.eye(len(axes))]
                 shares += [np.outer(r, r) - np.diag(r**2) for r in turned]
@@ -131,19 +154,27 @@ def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[i
 
 
 def driven_scalars(model: Model) -> IntArray:
-    """Columns of rotors, friction and offsets, without those of joints that have no motor, shape (s,)."""
+    """Columns of rotors, friction and offsets, without those of joints that have no motor,
+    shape (s,).
+    """
     of_links = model.link_columns.ravel()
-    undriven = [JOINT_COLUMNS * joint + np.arange(10, JOINT_COLUMNS) for joint in model.robot.passive_joints]
+    undriven = [
+        JOINT_COLUMNS * joint + np.arange(10, JOINT_COLUMNS) for joint in model.robot.passive_joints
+    ]
     return np.setdiff1d(np.arange(len(model.columns)), np.concatenate((of_links, *undriven)))
 
 
 def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
     """Q = L⁻¹ P L⁻ᵀ of links, shapes (n, 4, 4) and (n, 10) → (n, 4, 4)."""
     inverse = np.linalg.inv(factors)
-    return np.array([inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inverse, links, strict=True)])
+    return np.array(
+        [inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inverse, links, strict=True)]
+    )
 
 
-def solve_programme(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]) -> None:
+def solve_programme(
+    cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]
+) -> None:
     """Solve a programme by Clarabel; its unknowns have their values then.
 
     Raises:
@@ -159,9 +190,14 @@ def solve_programme(cp: Any, objective: Any, constraints: list[Any], unknowns: S
                 problem.solve(solver=cp.CLARABEL, **settings)
             except cp.SolverError as error:
                 message = str(error)
-        if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(one.value is not None for one in unknowns):
+        if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(
+            one.value is not None for one in unknowns
+        ):
             return
-    raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {message}".strip())
+    raise NotPhysical(
+        "the semidefinite programme has no solution",
+        f"{problem.status or 'failed'} {message}".strip(),
+    )
 
 
 def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:

@@ -1,4 +1,6 @@
-"""Physically consistent standard parameters: bodies, rotors and friction that could exist and have the same torque."""
+"""Physically consistent standard parameters:
+bodies, rotors and friction that could exist and have the same torque.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,22 @@ from ident.physical.consistency import (
     solve_programme,
 )
 
-_ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search
+#: The first programme keeps this multiple of the margin, so that the second has room to search
+_ROOM = 2.0
 _SCALAR_ROOM = 2e-7
-"""Lower bound of drive-chain parameters that may not be negative [share of the whole torque]: above the solver's
-tolerance, and too small to count as a change; the second programme keeps half of it."""
+"""Lower bound of drive-chain parameters that may not be negative [share of the whole torque]: above
+the solver's tolerance, and too small to count as a change; the second programme keeps half of it.
+"""
 _TRACE = 1e-8
-"""Weight that bounds the links in the first programme where the torque does not; the norm beside it is exact."""
+"""Weight that bounds the links in the first programme where the torque does not;
+the norm beside it is exact.
+"""
 _RIDGE = 1e-6
-"""Weight of the drive-chain parameters in the second: decides between those that the torque cannot distinguish."""
-_INVISIBLE = 1e-9  #: Change of the relative torque below which a unit step leaves the torque unchanged
+"""Weight of the drive-chain parameters in the second:
+decides between those that the torque cannot distinguish.
+"""
+#: Change of the relative torque below which a unit step leaves the torque unchanged
+_INVISIBLE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +57,8 @@ class Programme:
     triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
 
     def nearest(self, base: FloatArray) -> FloatArray:
-        """Find the consistent standard parameters whose torque is nearest to that of ``base``, shape (b,) → (c,).
+        """Find the consistent standard parameters whose torque is nearest to that of ``base``,
+        shape (b,) → (c,).
 
         Raises:
             NotPhysical: the solver found none.
@@ -59,13 +69,19 @@ class Programme:
         scalars = cp.Variable(len(self.consistency.scalars))
         constraints = self.consistency.constraints(cp, links, scalars, _ROOM * MARGIN, _SCALAR_ROOM)
         place = np.zeros((self.grouping.shape[1], len(self.consistency.scalars)))
-        place[self.consistency.scalars, np.arange(len(self.consistency.scalars))] = self.consistency.scales
+        place[self.consistency.scalars, np.arange(len(self.consistency.scalars))] = (
+            self.consistency.scales
+        )
         torque_of = self.triangle @ self.grouping
         torque = (torque_of @ place) @ scalars
-        for link, factor, columns in zip(links, self.factors, self.consistency.link_columns, strict=True):
+        for link, factor, columns in zip(
+            links, self.factors, self.consistency.link_columns, strict=True
+        ):
             # Standard parameters of the link per entry of Q, row by row.
             units = [link_parameters(factor @ unit.reshape(4, 4) @ factor.T) for unit in np.eye(16)]
-            torque = torque + (torque_of[:, columns] @ np.column_stack(units)) @ cp.vec(link, order="C")
+            torque = torque + (torque_of[:, columns] @ np.column_stack(units)) @ cp.vec(
+                link, order="C"
+            )
         distance = cp.norm2(torque - self.triangle @ base)
         size = sum(cp.trace(link) for link in links)
         solve_programme(cp, cp.Minimize(distance + _TRACE * size), constraints, (*links, scalars))
@@ -74,8 +90,9 @@ class Programme:
     def with_base(self, standard: FloatArray, base: FloatArray) -> FloatArray:
         """Change standard parameters, shape (c,), so that they have given base parameters.
 
-        The change is the least one, each parameter measured by the prior of its link or its scale. All of it in the
-        leading parameters would be more than a light link has, where the torque hardly shows a base parameter.
+        The change is the least one, each parameter measured by the prior of its link or its scale.
+        All of it in the leading parameters would be more than a light link has, where the torque
+        hardly shows a base parameter.
         """
         size = np.array([np.linalg.norm(self._scaled(unit)) for unit in np.eye(len(standard))])
         unit_change = np.where(size > 0.0, 1.0 / np.where(size > 0.0, size, 1.0), 0.0)
@@ -86,11 +103,12 @@ class Programme:
     def closest_to_prior(
         self, start: FloatArray, directions: FloatArray, base: FloatArray, farthest: float
     ) -> FloatArray:
-        """Find the standard parameters nearest to the prior with almost the same torque, shape (c,).
+        """Find the standard parameters nearest to the prior with almost the same torque,
+        shape (c,).
 
-        The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric Robot Dynamic
-        Identification, 2020): it does not depend on frames and units, and grows without limit towards an
-        impossible body.
+        The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric
+        Robot Dynamic Identification, 2020): it does not depend on frames and units, and grows
+        without limit towards an impossible body.
 
         Args:
             start: consistent standard parameters, shape (c,).
@@ -103,8 +121,11 @@ class Programme:
         """
         import cvxpy as cp  # noqa: PLC0415 - as above
 
-        # Orthonormal steps: the solver gets neither kg beside kg m² nor two directions that are almost one.
-        steps, upper = np.linalg.qr(np.column_stack([self._scaled(change) for change in directions.T]))
+        # Orthonormal steps: the solver gets neither kg beside kg m² nor two directions that are
+        # almost one.
+        steps, upper = np.linalg.qr(
+            np.column_stack([self._scaled(change) for change in directions.T])
+        )
         rotation = np.linalg.inv(upper)
         step = cp.Variable(steps.shape[1])
         moved = self._scaled(start) + steps @ step
@@ -126,22 +147,30 @@ class Programme:
     def _scaled(self, standard: FloatArray) -> FloatArray:
         """Q of every link, row by row, and the scaled other parameters, shape (16 n + s,)."""
         links = relative_to_prior(self.factors, standard[self.consistency.link_columns])
-        return np.concatenate((links.ravel(), standard[self.consistency.scalars] / self.consistency.scales))
+        return np.concatenate(
+            (links.ravel(), standard[self.consistency.scalars] / self.consistency.scales)
+        )
 
     def _standard(self, links: FloatArray, scalars: FloatArray) -> FloatArray:
-        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters, shape (c,)."""
+        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters,
+        shape (c,).
+        """
         standard = np.zeros(self.grouping.shape[1])
         standard[self.consistency.scalars] = self.consistency.scales * scalars
-        for link, factor, columns in zip(links, self.factors, self.consistency.link_columns, strict=True):
+        for link, factor, columns in zip(
+            links, self.factors, self.consistency.link_columns, strict=True
+        ):
             standard[columns] = link_parameters(factor @ link @ factor.T)
         return standard
 
 
 DEFAULT_MASS_KG = 1.0  #: Mass of a link without one in the URDF
-DEFAULT_RADIUS_M = 0.1  #: Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist
+#: Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist
+DEFAULT_RADIUS_M = 0.1
 _THINNEST = 1e-6
-"""Smallest share of a ball's second moment that a link of the URDF may have in any direction: rods and plates pass,
-rounding errors around zero do not."""
+"""Smallest share of a ball's second moment that a link of the URDF may have in any direction:
+rods and plates pass, rounding errors around zero do not.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +182,8 @@ class InertiaPrior:
 
 
 def urdf_links(urdf: str) -> FloatArray:
-    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints, shape (n, 10).
+    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints,
+    shape (n, 10).
 
     Raises:
         ModelError: the text is no URDF.
@@ -162,10 +192,11 @@ def urdf_links(urdf: str) -> FloatArray:
 
 
 def inertia_prior(urdf: str) -> InertiaPrior:
-    """Take the URDF's inertias where a body can have them, else those of a solid ball about the centre of mass.
+    """Take the URDF's inertias where a body can have them,
+    else those of a solid ball about the centre of mass.
 
-    The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass, DEFAULT_MASS_KG at the
-    origin of the link frame.
+    The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass,
+    DEFAULT_MASS_KG at the origin of the link frame.
 
     Raises:
         ModelError: the text is no URDF.
@@ -184,19 +215,24 @@ def inertia_prior(urdf: str) -> InertiaPrior:
     return InertiaPrior(links, tuple(assumed))
 
 
-_SAME = 1e-4  #: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
+#: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
+_SAME = 1e-4
 
 
 def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
     """Draw independent states within limits, to test statements about every motion.
 
     Args:
-        limits: middle of the range, half the range, speed and acceleration of each joint, in four rows [rad or m, and
-            their derivatives], shape (4, n).
+        limits: middle of the range, half the range, speed and acceleration of each joint, in four
+            rows [rad or m, and their derivatives], shape (4, n).
         samples: k.
         seed: the same seed gives the same states.
     """
-    draw = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, limits.shape[1], samples)).transpose(0, 2, 1)
+    draw = (
+        np.random.default_rng(seed)
+        .uniform(-1.0, 1.0, (3, limits.shape[1], samples))
+        .transpose(0, 2, 1)
+    )
     middle, *sizes = limits
     position, velocity, acceleration = (size * part for size, part in zip(sizes, draw, strict=True))
     return Motion(middle + position, velocity, acceleration)
@@ -205,8 +241,9 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
 def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BaseParameters:
     """Compute the weights of standard parameters in each base parameter to full precision.
 
-    A calibration keeps the weights of the grouping as text of six decimals; its leading names are exact. Every column
-    is a combination of the leading ones (paper §2.1), so the weights follow from any motion that is rich enough.
+    A calibration keeps the weights of the grouping as text of six decimals; its leading names are
+    exact. Every column is a combination of the leading ones (paper §2.1), so the weights follow
+    from any motion that is rich enough.
 
     Args:
         model: the declared model of the robot.
@@ -214,15 +251,17 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
         columns: the model's regressor of such a motion, rows of all joints, shape (m, c).
 
     Raises:
-        ModelError: the names are not those of this robot: unknown, or with other weights (another geometry, other
-            gravity), or too few (not everything was identifiable in the fit) or too many.
+        ModelError: the names are not those of this robot: unknown, or with other weights (another
+            geometry, other gravity), or too few (not everything was identifiable in the fit) or too
+            many.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     leading = [name.split(" ", 1)[0] for name in names]
     foreign = [name for name in leading if name not in index]
     if foreign:
         raise ModelError(
-            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; use the cell of the "
+            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; "
+            "use the cell of the "
             "fit, with its drive train"
         )
     order = np.argsort([index[name] for name in leading])
@@ -235,14 +274,16 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     weights, _, rank, _ = linalg.lstsq(chosen, unit, cond=1e-9)
     if rank < len(independent):
         raise ModelError(
-            f"the calibration has {len(independent)} base parameters, this robot only {rank}: another geometry, "
+            f"the calibration has {len(independent)} base parameters, this robot only {rank}: "
+            "another geometry, "
             "gravity or drive train"
         )
     left = np.linalg.norm(unit - chosen @ weights, axis=0)
     unseen = [column.name for column, rest in zip(model.columns, left, strict=True) if rest > 1e-6]
     if unseen:
         raise ModelError(
-            f"the calibration lacks {', '.join(unseen)}, which this robot's torque depends on: its data did not "
+            f"the calibration lacks {', '.join(unseen)}, which this robot's torque depends on: its "
+            "data did not "
             "determine them, or it is of another robot"
         )
     grouping = weights * scale / scale[list(independent), None]
@@ -250,19 +291,27 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     for row, name in zip(grouping, ordered, strict=True):
         for sign, size, other in TERM.findall(name):
             declared = float(sign + size)
-            found = float(row[index[other]]) if other in index else float("nan")
+            if other in index:
+                found = float(row[index[other]])
+            else:
+                found = float("nan")
             if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):
                 raise ModelError(
-                    f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; this robot's "
-                    f"geometry gives {found:.6g}: it is not the robot, the gravity or the drive train of the fit"
+                    f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; "
+                    "this robot's "
+                    f"geometry gives {found:.6g}: it is not the robot, the gravity or the drive "
+                    "train of the fit"
                 )
     return BaseParameters(independent, grouping, ordered)
 
 
-EXACT = 1e-6  #: Share of the torque below which a consistent set counts as predicting the identified torque
+#: Share of the torque below which a consistent set counts as predicting the identified torque
+EXACT = 1e-6
 SLACK = 0.1
-"""If the nearest torque is not the identified one, bodies are sought among all that are at most this share farther from
-it: right at the nearest there is no choice left, and the errors of the data decide on the bodies."""
+"""If the nearest torque is not the identified one, bodies are sought among all that are at most
+this share farther from it: right at the nearest there is no choice left, and the errors of the data
+decide on the bodies.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,7 +322,8 @@ class PhysicalParameters:
     standard: FloatArray  #: χ_st, shape (c,)
     base: BaseParameters  #: grouping of the base parameters
     identified: FloatArray  #: given values of the base parameters, shape (b,)
-    realised: FloatArray  #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
+    #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
+    realised: FloatArray
     #: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
     torque_change_percent: RelativeError
     #: Smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
@@ -300,18 +350,19 @@ def physical_parameters(
 ) -> PhysicalParameters:
     """Find physically consistent standard parameters that predict the torque of base parameters.
 
-    Consistent is what `ident.physical.consistency` says. The first programme finds
-    the torque nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second finds, of
-    all sets with this torque, the one nearest to the prior.
+    Consistent is what `ident.physical.consistency` says. The first programme finds the torque
+    nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second
+    finds, of all sets with this torque, the one nearest to the prior.
 
     Args:
         model: the declared model.
         base: the grouping of its base parameters.
         values: identified values, shape (b,).
-        columns: the model's regressor of a rich motion, shape (n, c, k), whose torque measures the distance.
+        columns: the model's regressor of a rich motion, shape (n, c, k), whose torque measures the
+            distance.
         prior: expected links.
-        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
-            sign.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv
+            alone may have any sign.
 
     Raises:
         NotPhysical: no set was found, or it does not pass its own test.
@@ -351,16 +402,21 @@ def physical_parameters(
         identified=values,
         realised=base.grouping @ standard,
         torque_change_percent=relative_error(
-            identified, np.einsum("jck,c->jk", columns, standard), np.ones(identified.shape, dtype=np.bool_)
+            identified,
+            np.einsum("jck,c->jk", columns, standard),
+            np.ones(identified.shape, dtype=np.bool_),
         ),
         eigenvalues=np.asarray(
-            np.linalg.eigvalsh(relative_to_prior(programme.factors, standard[model.link_columns]))[:, 0],
+            np.linalg.eigvalsh(relative_to_prior(programme.factors, standard[model.link_columns]))[
+                :, 0
+            ],
             dtype=np.float64,
         ),
     )
     if not np.all(found.eigenvalues >= 0.5 * MARGIN):
         raise NotPhysical(
-            "the solution has an impossible link", f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}"
+            "the solution has an impossible link",
+            f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}",
         )
     return found
 

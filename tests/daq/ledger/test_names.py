@@ -1,4 +1,6 @@
-"""A history is of one robot: another one of its name is left out and named, and a renamed cell keeps its history."""
+"""A history is of one robot: another one of its name is left out and named,
+and a renamed cell keeps its history.
+"""
 
 from __future__ import annotations
 
@@ -75,12 +77,16 @@ def ledger(tmp_path: Path) -> Ledger:
 
 @pytest.fixture
 def renamed(ledger: Ledger) -> Ledger:
-    """The ledger of cell `press`, which was called demo and has three calibrations, a write and a session."""
+    """The ledger of cell `press`, which was called demo and has three calibrations,
+    a write and a session.
+    """
     digests = [_enter(ledger, _made(ledger.cell, week), week) for week in range(3)]
     write(ledger, drives_of("demo"), sha256(b"1"), digest=digests[0], at=BEGIN)
     acknowledge(ledger, "J1", since=BEGIN, at=BEGIN, who="anna", why="new gearbox")
     details = {"session": "s", "cell": "demo", "calibration_sha256": digests[0]}
-    record_session(ledger.audit, AuditAction.ACCEPTED, at=BEGIN, who="anna", subject="s", details=details)
+    record_session(
+        ledger.audit, AuditAction.ACCEPTED, at=BEGIN, who="anna", subject="s", details=details
+    )
     return _named(ledger, "press")
 
 
@@ -88,14 +94,22 @@ def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
     for week in range(3):
         _enter(ledger, _made(ledger.cell, week), week)
     other = replace(ledger, cell=_other_robot(ledger.cell))
-    with pytest.raises(DataError, match=r"drive of J4 with product code 0x40200; expected .*0x40300"):
+    with pytest.raises(
+        DataError,
+        match=r"drive of J4 with product code 0x40200; expected "
+        r".*0x40300",
+    ):
         _enter(other, _made(other.cell, 3, FALLEN), 3)
     history = read_history(other)
     assert history.entries == ()
     assert watch(history.entries, history.acknowledgements) == ()
-    assert [one.entry.digest for one in history.other_robots] == [one.digest for one in read_history(ledger).entries]
+    assert [one.entry.digest for one in history.other_robots] == [
+        one.digest for one in read_history(ledger).entries
+    ]
     said = str(history.other_robots[0])
-    assert "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200" in said
+    assert (
+        "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200"
+    ) in said
     assert "expected drive of J4 with product code 0x40300, as in the cell file" in said
     assert verify_ledger(other).unknown == ()
 
@@ -121,7 +135,12 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
     assert read_history(renamed).entries == ()
     assert read_history(renamed).possible_names == ("demo",)
     planned = plan_rename(renamed, "demo")
-    assert (planned.calibrations, planned.writes, planned.acknowledgements, planned.undescribed) == (3, 1, 1, 0)
+    assert (
+        planned.calibrations,
+        planned.writes,
+        planned.acknowledgements,
+        planned.undescribed,
+    ) == (3, 1, 1, 0)
     assert ledger.audit.read_bytes() == lines
     rename_cell(renamed, planned, who="anna", at=LATER)
     # The chain is what it was, and one entry longer.
@@ -146,7 +165,9 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
     assert of_j4.alarmed
 
 
-def test_what_is_entered_under_the_old_name_later_is_of_another_cell(ledger: Ledger, renamed: Ledger) -> None:
+def test_what_is_entered_under_the_old_name_later_is_of_another_cell(
+    ledger: Ledger, renamed: Ledger
+) -> None:
     rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
     # The same robot, by a cell file that still has the old name.
     with pytest.raises(DataError, match=r"'demo', which this robot had until .*expected 'press'"):
@@ -179,7 +200,8 @@ def _rename(ledger: Ledger, old: str, week: int) -> None:
 
 def test_a_name_that_a_rename_has_freed_may_be_that_of_another_cell(ledger: Ledger) -> None:
     """The name that one robot had is another one's by now: each keeps its own calibrations."""
-    first, second = ledger, _named(ledger, "press")
+    first = ledger
+    second = _named(ledger, "press")
     of_first = _enter(first, _made(first.cell, 0), 0)
     of_second = _enter(second, _made(second.cell, 1, FALLEN), 1)
     line = _named(ledger, "line")
@@ -199,7 +221,9 @@ def test_a_job_that_was_held_for_its_old_name_is_no_history_of_that_name(renamed
     _rename(renamed, "demo", 11)
     before = len(read(renamed.audit))
     began = AuditAction.RECALIBRATION_BEGUN
-    record_session(renamed.audit, began, at=LATER, who="timer", subject="s", details={"cell": "demo"})
+    record_session(
+        renamed.audit, began, at=LATER, who="timer", subject="s", details={"cell": "demo"}
+    )
     planned = plan_rename(renamed, "demo")
     assert planned.entered_at is not None
     rename_cell(renamed, planned, who="anna", at=LATER)
@@ -213,12 +237,16 @@ def test_a_rename_to_the_name_of_another_robot_is_refused(ledger: Ledger) -> Non
     _enter(other, _made(other.cell, 0), 0)
     lines = ledger.audit.read_bytes()
     for wanted, name in ((press, "press"), (other, "demo")):
-        with pytest.raises(DataError, match=f"another robot with the cell name '{name}': found drive of J4"):
+        with pytest.raises(
+            DataError, match=f"another robot with the cell name '{name}': found drive of J4"
+        ):
             plan_rename(wanted, "demo")
     assert ledger.audit.read_bytes() == lines
 
 
-def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(renamed: Ledger) -> None:
+def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(
+    renamed: Ledger,
+) -> None:
     with pytest.raises(DataError, match="nothing of a cell 'dmeo'; cells in it: 'demo'"):
         plan_rename(renamed, "dmeo")
 
@@ -237,15 +265,21 @@ def _sessions_of(folder: Path, cell: str, count: int) -> None:
 def test_sessions_get_the_new_name_unless_they_began_after_the_rename(tmp_path: Path) -> None:
     _sessions_of(tmp_path, "demo", 3)
     _sessions_of(tmp_path, "gantry", 1)
-    count = rename_sessions([tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1))
+    count = rename_sessions(
+        [tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1)
+    )
     assert count == 2
     assert len(sessions(tmp_path, "press")) == 2
     assert len(sessions(tmp_path, "demo")) == 1
     assert len(sessions(tmp_path, "gantry")) == 1
 
 
-def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(tmp_path: Path) -> None:
-    """Kill it at every eighth call: before the entry, in the middle of the sessions, and behind them."""
+def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(
+    tmp_path: Path,
+) -> None:
+    """Kill it at every eighth call: before the entry, in the middle of the sessions,
+    and behind them.
+    """
 
     def prepared(folder: Path) -> tuple[Ledger, Callable[[], int]]:
         folder.mkdir()
@@ -290,7 +324,11 @@ def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one
 @pytest.fixture
 def cell_file(checkout: Path, tmp_path: Path) -> Path:
     """A demo cell, with two calibrations and a guided session under its name."""
-    text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8").replace("../", f"{checkout}/configs/")
+    text = (
+        (checkout / "configs/cells/demo.yaml")
+        .read_text(encoding="utf-8")
+        .replace("../", f"{checkout}/configs/")
+    )
     path = tmp_path / "cell.yaml"
     path.write_text(text, encoding="utf-8")
     ledger = Ledger.of(load_cell(path))
@@ -304,7 +342,9 @@ def cell_file(checkout: Path, tmp_path: Path) -> Path:
 def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1))
+    cell_file.write_text(
+        cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    )
     audit = cell_file.with_name("cell.audit.jsonl")
     lines = audit.read_bytes()
     assert main(["history", str(cell_file)]) == ExitCode.OK
@@ -312,7 +352,9 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     capsys.readouterr()
     assert main(["history", str(cell_file), "--rename", "demo"]) == ExitCode.OK
     said = " ".join(capsys.readouterr().err.split())
-    assert "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session." in said
+    assert (
+        "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session."
+    ) in said
     assert audit.read_bytes() == lines
     assert len(sessions(sessions_folder(cell_file), "demo")) == 1
     assert main(["history", str(cell_file), "--rename", "demo", "--yes", "--json"]) == ExitCode.OK
@@ -323,7 +365,9 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
     assert names_of(load_cell(cell_file)) == {"press", "demo"}
     # A copy of the cell file with the old name, as a schedule may have.
-    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1))
+    cell_file.write_text(
+        cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
+    )
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
 
