@@ -291,9 +291,8 @@ class OutputFailed(DaqError):
                 expected="a user who may keep owner and group of the file, so that who reads it "
                 "now can read it then",
                 remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, "
-                "or `usermod -aG` "
-                "and a new login), or give the file to this user (`chown`, `chgrp`) if the "
-                "controller can read it then",
+                "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
+                "`chgrp`) if the controller can read it then",
             )
         return cls(
             str(path),

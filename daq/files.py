@@ -290,9 +290,8 @@ def _open_lock(lock: Path) -> int:
             descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _LOCK_MODE)
             try:
                 os.fchmod(descriptor, _LOCK_MODE)  # whatever the umask
-            except (
-                BaseException
-            ):  # an interrupt too: a lock that others cannot open must not stay behind
+            # An interrupt too: a lock that others cannot open must not stay behind.
+            except BaseException:
                 os.close(descriptor)
                 lock.unlink(missing_ok=True)
                 raise

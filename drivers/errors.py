@@ -168,10 +168,9 @@ class NodeMissing(DriverError):
 
     def __init__(self, nodes: Sequence[Node], found: tuple[int, ...], waited_s: float) -> None:
         super().__init__(
-            f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s "
-            f"(answered: {', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate "
-            "and node id; a drive "
-            "that was switched on just now answers once it has booted: try again then"
+            f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s (answered: "
+            f"{', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id; "
+            "a drive that was switched on just now answers once it has booted: try again then"
         )
         self.node_ids = tuple(node if isinstance(node, int) else node.node_id for node in nodes)
         self.found = found
@@ -183,10 +182,9 @@ class NodeMisplaced(DriverError):
     def __init__(self, node_id: int, expected: str, found: str, axis: str = "") -> None:
         super().__init__(
             f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell "
-            "configuration has it on bus "
-            f"{expected}: it is wired to the other bus, two amplifiers have that node id, or both "
-            "CAN interfaces are "
-            "on one wire; `drivers.scan` shows the nodes of each bus"
+            f"configuration has it on bus {expected}: it is wired to the other bus, two amplifiers "
+            "have that node id, or both CAN interfaces are on one wire; `drivers.scan` shows the "
+            "nodes of each bus"
         )
         self.node_id = node_id
         self.expected = expected
@@ -264,10 +262,8 @@ class ParametersMixed(DriverError):
     def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
         super().__init__(
             "the write failed midway; the previous values are restored in "
-            f"{', '.join(restored) or 'no drive'}, and "
-            f"NOT confirmed where {'; '.join(problems)}; do not enable an axis before every drive "
-            "has its previous "
-            "value again"
+            f"{', '.join(restored) or 'no drive'}, and NOT confirmed where {'; '.join(problems)}; "
+            "do not enable an axis before every drive has its previous value again"
         )
         self.restored = restored
         self.problems = problems
@@ -353,8 +349,8 @@ class MotionTimeout(DriverError):
             found = "did not clear statusword bit 12 (set-point acknowledge)"
             remedy = (
                 "the drive still works on an earlier set-point: check that it is in profile "
-                "position mode (6061h = 1) "
-                "and that nothing else gives it set-points; switch it off and on"
+                "position mode (6061h = 1) and that nothing else gives it set-points; switch it "
+                "off and on"
             )
         if other_master:
             found = f"{found}, and {other_master},"

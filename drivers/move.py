@@ -116,8 +116,8 @@ def check_moves(
         raise MotionRefused("the permission names no operator: set granted_by")
     if len(permission.limits) != len(names):
         raise MotionRefused(
-            f"the permission has limits for {len(permission.limits)} axes, the "
-            f"cell has {len(names)}"
+            f"the permission has limits for {len(permission.limits)} axes, the cell has "
+            f"{len(names)}"
         )
 
     def check_positions(event: str, positions: Sequence[int]) -> None:

@@ -356,10 +356,9 @@ class Calibration:
         if [len(row) for row in self.covariance_factor] != list(range(1, size + 1)):
             raise ModelError(
                 f"covariance_factor of the calibration of cell {self.cell!r} has "
-                f"{len(self.covariance_factor)} rows; "
-                f"expected {size} of one to {size} entries, for {len(self.gains)} gains and "
-                f"{len(self.parameters)} "
-                "parameters: fit the logs again"
+                f"{len(self.covariance_factor)} rows; expected {size} of one to {size} entries, "
+                f"for {len(self.gains)} gains and {len(self.parameters)} parameters: fit the logs "
+                "again"
             )
         lower = np.zeros((size, size))
         lower[np.tril_indices(size)] = np.concatenate(self.covariance_factor)
@@ -416,15 +415,13 @@ def calibration_of(
     if nameplate_gains.ndim != 1 or not nameplate_gains.all():
         raise ModelError(
             f"nameplate is {nameplate_gains.tolist()}; expected one gain per axis, none of them "
-            "zero: take them from "
-            "the data sheet, or the identified ones"
+            "zero: take them from the data sheet, or the identified ones"
         )
     units = units or ("Nm/A",) * len(axes)
     if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
             f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} "
-            "units for "
-            f"{len(estimate.gains)} identified gains; expected one of each for each axis"
+            f"units for {len(estimate.gains)} identified gains; expected one of each for each axis"
         )
     parameters = tuple(
         Parameter(column.name, float(value + column.about), float(std), column.unit)

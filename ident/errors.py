@@ -77,8 +77,7 @@ class CurrentUnsigned(DataUnfit):
         self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
         self.found = (
             f"currents that are never {missing_sign} while the axes move both ways, and that no "
-            "load which is always "
-            "carried explains"
+            "load which is always carried explains"
         )
         self.expected = "a current with its sign: that of the torque"
         self.remedy = (
@@ -115,8 +114,7 @@ class JointStill(ChannelUnfit):
             found=found,
             expected="a joint that moves in runs without load and in runs with each payload",
             remedy="if it stood still, record this run again with moves of every joint; if it "
-            "moved, check its encoder "
-            "or the column of its position",
+            "moved, check its encoder or the column of its position",
         )
 
 
@@ -187,8 +185,7 @@ class TooFewMoves(IdentificationError):
     def __init__(self, found: int, expected: int) -> None:
         super().__init__(
             f"the runs hold {found} separate moves (or stretches of two seconds), expected at "
-            f"least {expected} "
-            "and better 30 a run; record longer"
+            f"least {expected} and better 30 a run; record longer"
         )
         self.found = found
         self.expected = expected
@@ -211,11 +208,9 @@ class PayloadUnseen(IdentificationError):
     ) -> None:
         super().__init__(
             f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, "
-            "expected some 1 %, "
-            f"and on one at most {100.0 * LARGEST_GAIN_STD:g} %: "
-            "the runs declared loaded and those declared unloaded do not differ by the weight of "
-            "the payload, or are "
-            "positions not in rad, or columns in another order than the joints? "
+            f"expected some 1 %, and on one at most {100.0 * LARGEST_GAIN_STD:g} %: the runs "
+            "declared loaded and those declared unloaded do not differ by the weight of the "
+            "payload, or are positions not in rad, or columns in another order than the joints? "
             + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")
         )
         self.std_percent = std_percent
@@ -247,8 +242,7 @@ class NotConverged(IdentificationError):
         question = likely_cause or "are roles, payload mass, drive train, rad and axis order ok?"
         super().__init__(
             f"{method} did not converge in {iterations} iterations: the cost went from "
-            f"{cost[0]:.6g} to {cost[-1]:.6g} "
-            f"and the last relative step was {step:.2g}; {question}"
+            f"{cost[0]:.6g} to {cost[-1]:.6g} and the last relative step was {step:.2g}; {question}"
         )
         self.method = method
         self.iterations = iterations
@@ -279,8 +273,7 @@ class EffectNotInstalled(EffectRefused):
         if package.startswith("module "):
             self.remedy = (
                 "give it as an argument (`own_effects`), or install it in a package with an entry "
-                "point of the group "
-                "drivegain.effects"
+                "point of the group drivegain.effects"
             )
         else:
             self.remedy = "install this package, or fit the logs again without it"

@@ -213,8 +213,7 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
         if leading not in index:
             raise ModelError(
                 f"the calibration of cell {calibration.cell!r} has a parameter {parameter.name!r}; "
-                "the model of "
-                f"{model.robot.joint_count} joints has {', '.join(index)}"
+                f"the model of {model.robot.joint_count} joints has {', '.join(index)}"
             )
         standard[index[leading]] = parameter.value
         names.append(parameter.name)
@@ -232,10 +231,8 @@ def _require_same_robot(calibration: Calibration, model: Model, names: Sequence[
     if foreign is not None:
         raise ModelError(
             f"the calibration of cell {calibration.cell!r} has the base parameter {foreign!r}, "
-            "which another geometry "
-            "gathers; expected a calibration of the model's robot; give the model (URDF, gravity, "
-            "drive train) that it "
-            "was fitted with"
+            "which another geometry gathers; expected a calibration of the model's robot; give the "
+            "model (URDF, gravity, drive train) that it was fitted with"
         )
 
 
@@ -267,8 +264,7 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
         raise DataUnfit(
             run,
             f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has "
-            f"{mass.value:g} kg: "
-            "give each way of mounting a name of its own",
+            f"{mass.value:g} kg: give each way of mounting a name of its own",
         )
     return replace(
         payload, known={name: value for name, value in payload.known.items() if name not in own}
@@ -378,9 +374,8 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
         raise DataUnfit(
             data.name,
             f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the "
-            "fit: the calibration "
-            f"holds the rest of its inertia on mounting {payload.mounting!r}; give another body "
-            "another mounting",
+            f"fit: the calibration holds the rest of its inertia on mounting {payload.mounting!r}; "
+            "give another body another mounting",
         )
     return payload_parameters(payload, identified)
 

@@ -84,8 +84,7 @@ BY_JOB = {
             "residual",
             "daq.cli.fit:residual_verb",
             "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out "
-            "calibration.yaml "
-            "--report report",
+            "calibration.yaml --report report",
             "Fit, then detect and add missing effects.",
         ),
         Verb(
@@ -311,10 +310,8 @@ def build_app() -> typer.Typer:
         help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the "
         "calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 "
-        "calibration refused, "
-        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate "
-        "(11: the interlock refuses, 12: the bus is taken), "
-        "130 interrupted.",
+        "calibration refused, 4 data unfit, 5 device fault, 6 configuration, 10 to 14 see "
+        "recalibrate (11: the interlock refuses, 12: the bus is taken), 130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},
         pretty_exceptions_enable=False,
@@ -397,9 +394,8 @@ def _run(words: list[str], json_wanted: bool) -> int:
         return failure.exit_code
     except OSError as error:
         return _output_failed(error, json_wanted)
-    except (
-        SystemExit
-    ) as stop:  # typer ends so after an option such as --show-completion, rich at a closed pipe
+    # Typer ends so after an option such as --show-completion, rich at a closed pipe.
+    except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):
             return _output_failed(stop.__context__, json_wanted)
         ended = stop.code
@@ -426,9 +422,8 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
     if error.ctx is not None:
         command = error.ctx.command_path
         usage = error.ctx.get_usage()
-    elif verb := _verb_of(
-        words
-    ):  # the parser knows no verb where an option ends the line without its value
+    elif verb := _verb_of(words):
+        # The parser knows no verb where an option ends the line without its value.
         command = f"drivegain {verb}"
     found = str(error.format_message())
     param = getattr(error, "param", None)

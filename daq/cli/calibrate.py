@@ -186,8 +186,7 @@ def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
         return f"Found {mass_kg:g}, which is the mass in grams; {expected}. Type it in kg."
     return (
         f"Found {mass_kg:g} kg; {expected}. Weigh it again. If the cell file is wrong, press "
-        "Ctrl-C and correct it: "
-        "all gains are in proportion to this mass."
+        "Ctrl-C and correct it: all gains are in proportion to this mass."
     )
 
 

@@ -27,16 +27,15 @@ from ident import errors as identification
 if TYPE_CHECKING:
     from daq.report.document import ErrorReport
 
+#: Errors of the identification that have found, expected and remedy.
 WITH_EVIDENCE = (
     identification.ModelContradicted
     | identification.PayloadMissing
     | identification.CurrentUnsigned
     | identification.ChannelUnfit
-)  #: Errors of the identification that have found, expected and remedy
+)
 NOTES = ("kept", "hint")
-"""Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint:
-…")``.
-"""
+"""Labels of the notes that are shown. A verb adds one by ``error.add_note("hint: …")``."""
 NOT_STOPPED = "{} NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 _VCAN = "`sudo modprobe vcan`, `sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
@@ -121,8 +120,8 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "the payload in every run that declares it, in no other, and heavy enough for the moves "
         "to show it",
         "check what was mounted in each run (`drivegain info LOG` shows what it declares) and "
-        "record the wrong one "
-        "again; if all are right, use a heavier payload or a plan of `drivegain plan`",
+        "record the wrong one again; if all are right, use a heavier payload or a plan of "
+        "`drivegain plan`",
     ),
     identification.NotConverged: (
         "a fit that settles",
@@ -153,8 +152,8 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
         driver.NodeMissing: (
             "an answer from every axis of the cell file",
             "check, in this order, the supply of the drives, wiring and termination (60 Ω between "
-            "CAN_H and CAN_L "
-            "without power), the bit rate, and the node ids; `--wait 2` waits longer",
+            "CAN_H and CAN_L without power), the bit rate, and the node ids; `--wait 2` waits "
+            "longer",
         ),
         driver.NodeMisplaced: (
             "every axis on the bus that the cell file names",
@@ -187,8 +186,7 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
         driver.DriverError: (
             "a simulated cell that answers in time",
             "close other programs, because a busy computer answers late, and run `drivegain demo` "
-            "again; with the same "
-            "error on an idle one, choose another --seed",
+            "again; with the same error on an idle one, choose another --seed",
         ),
         identification.IdentificationError: (
             "five runs that identify every gain",
@@ -287,7 +285,7 @@ class ErrorParts:
         """Return the object of `--json`.
 
         It is made unchecked: an error is reported whatever is in it, and bytes of file names that
-            are not UTF-8 stay.
+        are not UTF-8 stay.
         """
         from daq.report.document import ErrorReport
 

@@ -24,8 +24,7 @@ def fleet_verb(
         str,
         typer.Option(
             help="threads of this process, processes of this machine, or the address of a dask "
-            "scheduler "
-            "(tcp://127.0.0.1:8786). The last two need pip install 'drivegain[fleet]'."
+            "scheduler (tcp://127.0.0.1:8786). The last two need pip install 'drivegain[fleet]'."
         ),
     ] = "threads",
     workers: Annotated[

@@ -201,8 +201,7 @@ def _require_log(ledger: Ledger, checked: Verification) -> None:
             "writes beside it",
             expected="the audit log with these writes",
             remedy="restore it with its `.head`, and ask who removed it; if it is kept elsewhere "
-            "on purpose, go on: "
-            "the next write begins a new log, and says so in it",
+            "on purpose, go on: the next write begins a new log, and says so in it",
         )
 
 
@@ -256,8 +255,7 @@ def _require(ledger: Ledger, checked: Verification) -> None:
             found=_first([*checked.broken, *unknown]),
             expected="calibrations that this version can read",
             remedy="use the version of drivegain that entered them, or keep this file and begin "
-            "another one under a "
-            "new name (`history.audit`)",
+            "another one under a new name (`history.audit`)",
         )
     if checked.unknown:
         raise HistoryUnreadable(
@@ -266,10 +264,9 @@ def _require(ledger: Ledger, checked: Verification) -> None:
             expected="a calibration in the history, and an end, of every write to this cell's "
             "controller",
             remedy="`drivegain history CELL --add CALIBRATION` for each calibration that was "
-            "written, which also "
-            "enters its writes from the audit; of a rollback with any one. Where a calibration is "
-            "lost, keep the file "
-            "and begin another one under a new name (`history.audit`)",
+            "written, which also enters its writes from the audit; of a rollback with any one. "
+            "Where a calibration is lost, keep the file and begin another one under a new name "
+            "(`history.audit`)",
         )
 
 
@@ -342,8 +339,7 @@ def _say_names(history: History, cell_file: Path) -> None:
         command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"
         _LOG.warning(
             "this cell has no calibration here, and cell %r, of a robot with the same joints and "
-            "drives, has; if this "
-            "is that robot under a new name: `%s`",
+            "drives, has; if this is that robot under a new name: `%s`",
             printable(name),
             command,
         )
@@ -388,8 +384,8 @@ def _rename(
         if planned.undescribed:
             say(
                 f"{counted(planned.undescribed, 'calibration')} of earlier versions do not say of "
-                "which robot: the "
-                "names of the axes are the same, and nothing else could be compared.",
+                "which robot: the names of the axes are the same, and nothing else could be "
+                "compared.",
                 err=True,
             )
         if not confirmed:
@@ -406,14 +402,12 @@ def _rename(
     else:
         say(
             f"{old!r} was renamed to {cell.name!r} on {planned.entered_at:%Y-%m-%d}; "
-            f"{counted(count, 'session')} taken "
-            "over now.",
+            f"{counted(count, 'session')} taken over now.",
             err=True,
         )
     say(
-        "Logs, plans and calibration files keep the old name: make new ones. A schedule of the "
-        "old name "
-        f"({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: "
+        "Logs, plans and calibration files keep the old name: make new ones. A schedule of the old "
+        f"name ({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: "
         "drivegain schedule.",
         err=True,
     )
@@ -482,9 +476,9 @@ def _day(text: str, now: datetime) -> datetime:
             "--since",
             found=f"{text!r}, which is {found:%Y-%m-%d %H:%M:%S} UTC",
             expected=f"no later than now, {now:%Y-%m-%d %H:%M:%S} UTC",
-            remedy="give the day of the change, with its zone where the day here is not "
-            "that of UTC "
-            "(2026-03-02T00:00+10:00); acknowledge the alarm of a coming change when it is shown",
+            remedy="give the day of the change, with its zone where the day here is not that of "
+            "UTC (2026-03-02T00:00+10:00); acknowledge the alarm of a coming change when it is "
+            "shown",
         )
     return found
 

@@ -82,7 +82,7 @@ class OutputWriter:
         self._write = write
         self._clock = clock
         self._pieces: SimpleQueue[Piece] = SimpleQueue()
-        # Of the numbers below; never held for longer than it takes to change them
+        # Guards the numbers below; it is never held for longer than it takes to change them.
         self._lock = threading.Lock()
         self._waiting_bytes = 0
         self._waiting_results = 0  # pieces

@@ -161,8 +161,7 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
             "hint: check the load of bus and computer, or use a longer `sync.period_us`"
             if real
             else "hint: a cell of `drivegain simulate` answers as fast as its computer can and "
-            "needs `sync.pacing: "
-            "lockstep` in the cell file"
+            "needs `sync.pacing: lockstep` in the cell file"
         )
 
 
@@ -205,8 +204,7 @@ def _next_command(part: Path) -> str:
     saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
     return (
         f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, "
-        "remove it "
-        f"(`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
+        f"remove it (`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
     )
 
 

@@ -164,8 +164,7 @@ def no_answer(
         "ever on it",
         expected="the bus of a simulated cell in a second terminal, or of a robot",
         remedy=f"start `drivegain simulate {name}`, and put the `bus` and `sync` that it prints "
-        "into a copy of the "
-        "cell file",
+        "into a copy of the cell file",
     )
 
 

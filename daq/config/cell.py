@@ -273,7 +273,7 @@ class Cell:
         """The controller's file under the name in the cell file, None if it is unknown.
 
         Symbolic links in that name are not resolved: `daq.writeback.file_access` decides which of
-            them may be followed.
+        them may be followed.
         """
         if self.controller is None or self.controller.file is None or self.folder is None:
             return None

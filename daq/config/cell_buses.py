@@ -187,9 +187,8 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
             yield Fault(
                 ("sync", "pacing"),
                 f"lockstep on a bus of interface {bus.interface}",
-                "timed: in lockstep the time of the samples is simulated, so only a simulated "
-                f"cell ({SIMULATED}) may "
-                "use it",
+                "timed: in lockstep the time of the samples is simulated, so only a simulated cell "
+                f"({SIMULATED}) may use it",
             )
         for other in model.buses[:index]:
             if _where(bus) == _where(other):
@@ -276,8 +275,7 @@ def _load_faults(
     yield Fault(
         ("sync", "period_us"),
         f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load "
-        f"bus {bus.name} "
-        f"by {load} at {bus.bitrate_bit_s} bit/s",
+        f"bus {bus.name} by {load} at {bus.bitrate_bit_s} bit/s",
         f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs "
         "at worst: " + ", or ".join(ways),
     )
@@ -358,10 +356,9 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
     if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return ()
     return tuple(
-        f"{bus.name}: when all its axes start, set-points and answers take "
-        f"{100 * load.start:.0f} % of a "
-        "period, and a late answer makes the run invalid; a longer sync.period_us or a second bus "
-        "has room for them"
+        f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} "
+        "% of a period, and a late answer makes the run invalid; a longer sync.period_us or a "
+        "second bus has room for them"
         for bus, load in bus_loads(cell)
         if load.start > 1.0
     )
@@ -393,8 +390,8 @@ def polling_warnings(cell: Cell) -> tuple[str, ...]:
     )
     return (
         "no room for SDO between two SYNCs: the drives' torque is not logged, and their "
-        "temperature only before and "
-        f"after the run; a sync.period_us of {100 * ceil(most / 100)} has room",
+        f"temperature only before and after the run; a sync.period_us of {100 * ceil(most / 100)} "
+        "has room",
     )
 
 

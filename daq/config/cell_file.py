@@ -287,8 +287,7 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
             ConfigurationMissing,
             expected=f"a file that belongs to {cell_file}, of at most {MAX_BYTES} bytes",
             remedy=f"copy it to this place, or correct its name in {cell_file.name} or in the "
-            "drive profile; a name is "
-            "relative to the file that has it",
+            "drive profile; a name is relative to the file that has it",
         )
     return content
 

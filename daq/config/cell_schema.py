@@ -96,8 +96,7 @@ class LimitsModel(StrictModel):
         if sorted(part.count(None) for part in (degrees, millimetres)) != [0, 3]:
             raise ValueError(
                 "position_deg, velocity_deg_s and acceleration_deg_s2, or for a prismatic joint "
-                "position_mm, "
-                "velocity_mm_s and acceleration_mm_s2"
+                "position_mm, velocity_mm_s and acceleration_mm_s2"
             )
         return self
 
@@ -148,9 +147,8 @@ class AxisModel(StrictModel):
     def _check_lead(self) -> AxisModel:
         if self.lead_mm is not None and not within(abs(self.lead_mm), LEAD_MM):
             raise ValueError(
-                "a lead_mm that is not zero: the travel of one turn, negative for a "
-                "left-handed screw; "
-                f"{LEAD_MM[0]:g} to {LEAD_MM[1]:g} mm in size"
+                "a lead_mm that is not zero: the travel of one turn, negative for a left-handed "
+                f"screw; {LEAD_MM[0]:g} to {LEAD_MM[1]:g} mm in size"
             )
         return self
 
@@ -268,16 +266,14 @@ class PolicyModel(StrictModel):
         MotionPolicy,
         Field(
             description="allowed: the scheduled job `recalibrate` may move the axes where the "
-            "interlock releases them. "
-            "`record` needs --enable-motion all the same."
+            "interlock releases them. `record` needs --enable-motion all the same."
         ),
     ] = MotionPolicy.ASK
     unguarded: Annotated[
         Permission,
         Field(
             description="allowed: the scheduled job may move axes that do not stop by themselves "
-            "when it is killed. "
-            "`record` needs --unguarded all the same."
+            "when it is killed. `record` needs --unguarded all the same."
         ),
     ] = Permission.REFUSED
     recovery_motion: Annotated[
@@ -316,8 +312,7 @@ class CellModel(StrictModel):
         bool,
         Field(
             description="Whether friction with a payload has parameters of its own, so that "
-            "friction that changes "
-            "between bare and loaded runs does not become gain."
+            "friction that changes between bare and loaded runs does not become gain."
         ),
     ] = False
     conditioning: ConditioningModel = ConditioningModel()

@@ -122,8 +122,8 @@ class ScaleModel(SectionModel):
         empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
         if empty or given - wanted or wanted - given - {"objects"}:
             raise ValueError(
-                f"{' and '.join(sorted(wanted))} of a scale of form "
-                f"{self.form.value}, and nothing else"
+                f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing "
+                "else"
             )
         return self
 

@@ -83,8 +83,8 @@ class ApplyPolicy:
     def _check_holdout_and_signers(self) -> ApplyPolicy:
         if self.signatures > len(self.signers):
             raise ValueError(
-                f"at least {self.signatures} `signers`, a public key by each name, "
-                "for so many signatures"
+                f"at least {self.signatures} `signers`, a public key by each name, for so many "
+                "signatures"
             )
         if self.by is AppliedBy.JOB and self.holdout is HoldOut.OPTIONAL:
             raise ValueError("`holdout: required` where the job applies by itself")

@@ -24,16 +24,14 @@ from ident.model.urdf import read_urdf
 
 _REMEDY = (
     "another robot's description gives wrong gains: give the description of this cell, or none, "
-    "since the log has its "
-    "own; `name`, `axes`, joints and drives have to be as in the log, and everything else may be "
-    "corrected"
+    "since the log has its own; `name`, `axes`, joints and drives have to be as in the log, and "
+    "everything else may be corrected"
 )
 
 
 _RECORD_AGAIN = (
     "the node numbers were exchanged after this recording, and a log keeps those that it was "
-    "recorded with: "
-    "record again with the corrected cell file"
+    "recorded with: record again with the corrected cell file"
 )
 
 

@@ -55,13 +55,12 @@ STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
 
 GONE = (
     "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by "
-    "themselves where they "
-    "supervise its heartbeat (1016h); look at the robot, and use the emergency stop if it moves"
+    "themselves where they supervise its heartbeat (1016h); look at the robot, and use the "
+    "emergency stop if it moves"
 )
 HANGS = (
     "The recorder is held, or waits for disk or bus; the amplifiers stop by themselves where they "
-    "supervise its "
-    "heartbeat (1016h). If the robot moves, use the emergency stop"
+    "supervise its heartbeat (1016h). If the robot moves, use the emergency stop"
 )
 UNKNOWN = "this page could not follow the recorder, and does not know how it ended"
 

@@ -39,9 +39,8 @@ LARGEST_READERS = 8  #: Pages that are served curves at the same time
 CONNECTIONS = 64  #: Without a request at the same time
 REQUEST_S = 5.0  #: Time for the first request of a connection
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src "
-    "'self' data:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
+    "data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 REPORT_POLICY = (
     "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'"
@@ -159,9 +158,8 @@ class Page:
         if not task.cancelled():
             cause = repr(task.exception())
             self._live.failed = (
-                f"A part of this console has ended ({cause}), so this "
-                "page is old: "
-                "restart the console"
+                f"A part of this console has ended ({cause}), so this page is old: restart the "
+                "console"
             )
 
     async def _look(self) -> None:

@@ -250,14 +250,13 @@ class CalibrationBody(StrictModel):
         for one in self.payload_mass:
             if [influence.axis for influence in one.gains] != axes:
                 raise ValueError(
-                    f"payload_mass of {one.payload} with an entry for each of the "
-                    f"axes {', '.join(axes)}"
+                    f"payload_mass of {one.payload} with an entry for each of the axes "
+                    f"{', '.join(axes)}"
                 )
             if one.parameters_per_kg and len(one.parameters_per_kg) != len(self.parameters):
                 raise ValueError(
                     f"payload_mass of {one.payload} with parameters_per_kg for each of the "
-                    f"{len(self.parameters)} "
-                    "parameters"
+                    f"{len(self.parameters)} parameters"
                 )
         return self
 

@@ -160,8 +160,7 @@ class Scalar:
                 found=f"{value:.6g} ± {std:.2g}, which the integer {rounded} does not represent",
                 expected="a rounding below σ",
                 remedy="this object is too coarse: write the gain to another one, or in a finer "
-                "unit by its factor in "
-                "`controller.gains`; nothing was written",
+                "unit by its factor in `controller.gains`; nothing was written",
             )
         return self.integer.spell(rounded, self.text)
 

@@ -96,8 +96,8 @@ def _require_written(context: SessionContext, session: Session) -> None:
             found="other values than those that this session wrote",
             expected="the written gains, read back before the moves that accept them",
             remedy="nothing has moved; see whether the drives lost power before they saved, or "
-            "were written since "
-            "(`drivegain history`), and write them again with `drivegain apply --drives`",
+            "were written since (`drivegain history`), and write them again with `drivegain apply "
+            "--drives`",
         )
     context.journal.say(Level.INFO, "the gains were read back from the drives")
 
@@ -149,8 +149,7 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     off = [one for one in scales if not _is_right(one)]
     remark = (
         f"the error of the torques is {after.error.total:.2f} % with the current gains, "
-        f"{before.error.total:.2f} % "
-        "with the previous gains"
+        f"{before.error.total:.2f} % with the previous gains"
     )
     if off:
         listed = ", ".join(_scale_text(one) for one in off)

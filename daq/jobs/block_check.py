@@ -185,10 +185,8 @@ def _limited(cell: Cell, facts: BlockFacts) -> str:
         if percent > most_percent:
             return (
                 f"{axis} was at its current limit for {percent:.1f} % of this block, and a write "
-                "takes at most "
-                f"{most_percent:g} %. Press Ctrl-C, lower the acceleration limit of {axis} in the "
-                "cell file, and start "
-                "again."
+                f"takes at most {most_percent:g} %. Press Ctrl-C, lower the acceleration limit of "
+                f"{axis} in the cell file, and start again."
             )
     return ""
 
@@ -210,8 +208,7 @@ def _bare_beside_bare(
     earlier = tuple(block.name for block in compared_with(blocks))
     text = (
         f"The flange carried about {-added_kg:.2g} kg less than in {' and '.join(earlier)}, where "
-        "it should be bare, "
-        "too. All of these are recorded again, without anything on the flange."
+        "it should be bare, too. All of these are recorded again, without anything on the flange."
     )
     return Mistake((*earlier, last.name), text)
 
@@ -241,8 +238,7 @@ def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
         return None
     text = (
         f"The centre of mass of {last.payload.upper()} was about {1000.0 * shift_m:.0f} mm away "
-        "from where it was in "
-        "the loaded blocks before: mount it as it was then, not turned."
+        "from where it was in the loaded blocks before: mount it as it was then, not turned."
     )
     return Mistake((last.name,), text)
 
@@ -287,15 +283,13 @@ def _loaded_beside_bare(
     if is_same:
         text = (
             f"The flange carried the same as in {bare} once more: if {name} is mounted now, it was "
-            "there before, too. "
-            f"{again}"
+            f"there before, too. {again}"
         )
         return Mistake(everything, text)
     if added_kg < 0.0:
         text = (
             f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more "
-            "without load than with "
-            f"{name}: the two were exchanged. {again}"
+            f"without load than with {name}: the two were exchanged. {again}"
         )
         return Mistake(everything, text)
     lower, upper = SAME_BODY

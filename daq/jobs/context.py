@@ -69,8 +69,7 @@ ASK_S = 0.1  #: Between two questions for the states
 STANDSTILL_S = 0.2  #: Between two readings of a position that must agree
 OTHERS = (
     "nothing was changed: end the other controller; if a recorder was killed there, `drivegain "
-    "record` takes the drive "
-    "over, or switch it off and on"
+    "record` takes the drive over, or switch it off and on"
 )
 
 Powered = tuple[tuple[Axis, int], ...]  #: Axes with power, and their statuswords
@@ -423,8 +422,7 @@ def section_of(cell: Cell) -> Recalibration:
             "an operator",
             expected="`policy: {motion: allowed}` in the cell file",
             remedy="nothing has moved; whoever answers for the cell writes it there, or a person "
-            "records with "
-            "`drivegain record`",
+            "records with `drivegain record`",
         )
     return cell.recalibration
 
@@ -446,8 +444,7 @@ def sessions_that_count(
             found=now.isoformat(timespec="seconds"),
             expected=f"a time after {PROGRAM_SINCE:%Y-%m-%d}, when this program was made",
             remedy="nothing was begun; set the clock (`timedatectl`): ages of calibrations, names "
-            "of folders, history "
-            "and audit log depend on it",
+            "of folders, history and audit log depend on it",
         )
     counted = begun_until(found, now)
     for session in found:
@@ -456,10 +453,9 @@ def sessions_that_count(
         text = (
             f"found {session.folder}, begun {session.state.began}; expected a time before now, "
             f"{now.isoformat(timespec='seconds')}; it counts neither for what is due nor as the "
-            "last calibration, and "
-            "is not continued. If it was made under a wrong date, move the folder away once its "
-            "logs are not needed; "
-            "if the clock is behind now, set it (`timedatectl`)"
+            "last calibration, and is not continued. If it was made under a wrong date, move the "
+            "folder away once its logs are not needed; if the clock is behind now, set it "
+            "(`timedatectl`)"
         )
         journal.say(
             Level.WARNING,
@@ -485,8 +481,7 @@ def _require_own_history(context: SessionContext) -> None:
             found=f"a robot that was renamed to {history.renamed.new!r} at {history.renamed.at}",
             expected="a cell file with its present name",
             remedy="nothing has moved; write the new name into the cell file, and make the "
-            "schedule again "
-            "(`drivegain schedule`)",
+            "schedule again (`drivegain schedule`)",
         )
     if history.other_robots:
         raise JobHeld(
@@ -494,16 +489,14 @@ def _require_own_history(context: SessionContext) -> None:
             found=str(history.other_robots[0]),
             expected="a history of one robot",
             remedy="nothing has moved; give the cell file of that robot, or name another audit log "
-            "for this one "
-            "(`history.audit` of the cell file)",
+            "for this one (`history.audit` of the cell file)",
         )
     for other in history.possible_names:
         text = (
             f"found calibrations of cell {other!r} in the audit log, of a robot with the same "
-            "joints and drives, and "
-            f"none of {name!r}; if this is that robot under a new name, `drivegain history "
-            f"{context.file} --rename "
-            f"{other}` takes its history and sessions over"
+            f"joints and drives, and none of {name!r}; if this is that robot under a new name, "
+            f"`drivegain history {context.file} --rename {other}` takes its history and sessions "
+            "over"
         )
         context.journal.say(Level.WARNING, "the cell may have been renamed", text=text)
 

@@ -50,7 +50,7 @@ def list_logs(place: str) -> tuple[StoredLog, ...]:
         with _name_errors(place):
             store, root = _store(place)
             if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
-                # File://: with links, pipes and devices, which fsspec does not report
+                # `file://` may have links, pipes and devices, which fsspec does not report.
                 logs = _listed_local(Path(root))
             else:
                 below = root.rstrip("/") + "/"

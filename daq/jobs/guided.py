@@ -360,11 +360,9 @@ class UntilPrecise:
         predicted_percent = float(outlook.scale[axis]) * made.predicted_std_percent[axis]
         purpose = (
             f"the gain that is farthest from its target after {len(guided(session).blocks)} "
-            f"blocks: {worst.axis}, "
-            f"± {worst.std_percent:.2f} % (target {worst.target_percent:g} %). With these moves ± "
-            f"{predicted_percent:.2f} % is predicted. They stay between the joint positions of the "
-            "first blocks, and "
-            "are no faster."
+            f"blocks: {worst.axis}, ± {worst.std_percent:.2f} % (target {worst.target_percent:g} "
+            f"%). With these moves ± {predicted_percent:.2f} % is predicted. They stay between the "
+            "joint positions of the first blocks, and are no faster."
         )
         write_plan(context, session.folder / plan_name(number), replace(made, purpose=purpose))
         return session
@@ -453,7 +451,7 @@ class UntilPrecise:
         """Load the moves of one of the first blocks if they were rehearsed; else make them.
 
         A later rehearsal may have found that blocks have to be longer: what the operator has seen
-            stays as it is.
+        stays as it is.
         """
         if number < guided(session).rehearsed:
             with suppress(ConfigurationError):  # what is missing or damaged is made again
@@ -571,8 +569,7 @@ def _require_same_payload(state: GuidedState, payload: str) -> None:
             found=f"a session whose blocks carry {others[0]!r}",
             expected="the same payload in all loaded blocks of a session",
             remedy=f"nothing moves; pass --payload {others[0]} to go on, or begin a new session in "
-            "another folder "
-            "(--sessions)",
+            "another folder (--sessions)",
         )
 
 
@@ -713,8 +710,7 @@ def require_same_cell(context: SessionContext, session: Session) -> None:
             found=f"another content (digest {found[:12]}) than at the start of this command",
             expected=expected,
             remedy="nothing moves; put the old content back and start the same command, which goes "
-            "on, or start it "
-            f"with the new content, which begins a new session{refit}",
+            f"on, or start it with the new content, which begins a new session{refit}",
         )
 
 

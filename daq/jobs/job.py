@@ -245,8 +245,7 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
             found=f"more than {minutes:g} min since it began",
             expected="its end within max_duration_min",
             remedy="the axes were commanded to stop, and the next job continues the session; find "
-            "in the log what "
-            "takes so long, or raise max_duration_min",
+            "in the log what takes so long, or raise max_duration_min",
         )
 
     @contextmanager

@@ -51,8 +51,7 @@ LOST = (
     "is complete"
 )
 ENDED = (
-    "the process that estimates them after each move has ended (exit code {code}); "
-    "the session "
+    "the process that estimates them after each move has ended (exit code {code}); the session "
     "goes on without it"
 )
 _LOOK = TypeAdapter(QuickLook)

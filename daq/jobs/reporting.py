@@ -292,8 +292,7 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                     differs = ": differs"
                 lines.append(
                     f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± "
-                    f"{gain.new_std:.2g} "
-                    f"{gain.unit}{change}{drift}{differs}"
+                    f"{gain.new_std:.2g} {gain.unit}{change}{drift}{differs}"
                 )
         if isinstance(state, GuidedState):
             lines += _guided_lines(state)
@@ -436,8 +435,7 @@ def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
         ],
         Outcome.UNFIT: [
             "find out what is wrong with the recordings (`drivegain info LOG`); the same command "
-            "then begins a new "
-            "session"
+            "then begins a new session"
         ],
         Outcome.STOPPED: [
             "remove the cause; the same command continues this session while it is recent"

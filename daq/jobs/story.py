@@ -74,8 +74,7 @@ def _gains(fields: Fields) -> str:
             why = f" ({worst['cause']})"
         lines.append(
             f"The target is ± {target}. {worst['axis']} needs the longest{why}: about "
-            f"{duration(left_s)} more at this "
-            "rate."
+            f"{duration(left_s)} more at this rate."
         )
     else:
         lines.append(f"Every gain is within ± {target}: the recording is complete.")
@@ -160,17 +159,16 @@ PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
 SENTENCES = {
     "session begun": "New session: {folder}",
     "session taken up": "The session continues. Already recorded: {recorded}.",
-    "an unfinished session is "
-    "not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
-    "drives are as declared, without fault and "
-    "without power": "Checked: disk, history, interlock, drives.",
-    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected "
-    "{expected}. The "
-    "moves take {duration_s:g} s instead.",
+    "an unfinished session is not taken "
+    "up": "! The unfinished session in {folder} is not continued: {reason}.",
+    "drives are as declared, without fault and without "
+    "power": "Checked: disk, history, interlock, drives.",
+    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. "
+    "The moves take {duration_s:g} s instead.",
     "moves to look at": "\nMoves to look at: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
-    "recording "
-    "is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is "
+    "recording is "
+    "invalid": "! This recording cannot be used: {reason}. It is kept, and the block is "
     "recorded again.",
     "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",

@@ -336,10 +336,8 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
                 found=f"line {number}, which drivegain did not write",
                 expected="an audit log whose entries were never changed",
                 remedy="if this is another file, correct `history.audit` of the cell file or "
-                "--audit; if it is the "
-                "audit log, check it with `drivegain history --verify`, then move it away, keep "
-                "it, and begin another; "
-                "nothing was written",
+                "--audit; if it is the audit log, check it with `drivegain history --verify`, then "
+                "move it away, keep it, and begin another; nothing was written",
             )
         unfinished.append(line)
     return None, unfinished[::-1]
@@ -403,8 +401,7 @@ def _require_target(path: Path) -> None:
             found=f"a link to {path.readlink()}, where there is no file",
             expected="a link to the cell's audit log",
             remedy="mount the disk that it is on, or correct the link; for a new audit log there "
-            "make an empty file; "
-            "nothing was written",
+            "make an empty file; nothing was written",
         )
 
 

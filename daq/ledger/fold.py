@@ -110,9 +110,9 @@ class ForeignEntry:
     def __str__(self) -> str:
         return (
             f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is of "
-            "another robot with the "
-            f"cell name {self.entry.cell!r}: found {found_text(self.differences)}; expected "
-            f"{expected_text(self.differences)}, as in the cell file"
+            f"another robot with the cell name {self.entry.cell!r}: found "
+            f"{found_text(self.differences)}; expected {expected_text(self.differences)}, as in "
+            "the cell file"
         )
 
 

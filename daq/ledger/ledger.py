@@ -150,8 +150,7 @@ class Migrated:
 
 MAY_LACK = (
     "the audit log is not what was written, so the history may lack something: `drivegain history "
-    "CELL --verify` says "
-    "what"
+    "CELL --verify` says what"
 )
 """What a reader of a history with `may_lack` must know."""
 
@@ -541,10 +540,8 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
         found=f"{places} not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
         remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "
-        "until that is "
-        "known trust the controller's file by its backups only, and begin another log under a "
-        "new name "
-        "(`history.audit`)",
+        "until that is known trust the controller's file by its backups only, and begin another "
+        "log under a new name (`history.audit`)",
     )
 
 
@@ -557,9 +554,8 @@ def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
         found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
         expected="a sound SQLite file whose calibrations can be read",
         remedy="ask who can write to it, and restore the last good one from a backup, or go on "
-        "without it: "
-        "`drivegain history CELL --migrate` keeps it under another name, and takes nothing "
-        "over from it",
+        "without it: `drivegain history CELL --migrate` keeps it under another name, and takes "
+        "nothing over from it",
     )
 
 

@@ -142,8 +142,7 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
         found=found,
         expected="the history that earlier versions of drivegain kept of a cell",
         remedy="restore the last good one from a backup, or go on without it: `drivegain history "
-        "CELL --migrate` "
-        "keeps it under another name",
+        "CELL --migrate` keeps it under another name",
     )
 
 

@@ -199,30 +199,26 @@ def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
 # Questions, not verdicts: a gain shows that the torque for a current has changed, not why.
 _LESS = (
     "less torque for the same current: magnets warmer than usual or demagnetised, a gear that "
-    "turns harder under load, "
-    "or an amplifier that was exchanged or scales its current otherwise? Worn teeth alone do not "
-    "change a ratio; they "
-    "show as backlash and friction (`drivegain residual`)"
+    "turns harder under load, or an amplifier that was exchanged or scales its current otherwise? "
+    "Worn teeth alone do not change a ratio; they show as backlash and friction (`drivegain "
+    "residual`)"
 )
 _MORE = (
     "more torque for the same current: magnets colder than usual, a gear that was greased or has "
-    "run in, or an "
-    "amplifier that was exchanged or scales its current otherwise? Magnets do not grow stronger"
+    "run in, or an amplifier that was exchanged or scales its current otherwise? Magnets do not "
+    "grow stronger"
 )
 _ALL_LESS = (
     "all gains fell by the same factor, as motors seldom do: is the payload heavier than the mass "
-    "that was entered, or "
-    "was the scale of the currents changed (RMS or peak, rated current)?"
+    "that was entered, or was the scale of the currents changed (RMS or peak, rated current)?"
 )
 _ALL_MORE = (
     "all gains rose by the same factor, as motors seldom do: is the payload lighter than the mass "
-    "that was entered, or "
-    "was the scale of the currents changed (RMS or peak, rated current)?"
+    "that was entered, or was the scale of the currents changed (RMS or peak, rated current)?"
 )
 _SEVERAL = (
     "several axes, each by an amount of its own: another temperature of the cell, a payload that "
-    "was mounted "
-    "otherwise, or amplifiers that were exchanged?"
+    "was mounted otherwise, or amplifiers that were exchanged?"
 )
 
 

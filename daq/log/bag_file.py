@@ -134,8 +134,7 @@ class SqliteBag:
         self, subject: str, found: str, expected: str = "a ROS 2 bag in SQLite"
     ) -> LogCorrupt:
         remedy = (
-            "copy it again from where it was recorded, or convert it: `ros2 bag "
-            "convert` with "
+            "copy it again from where it was recorded, or convert it: `ros2 bag convert` with "
             "storage_id mcap"
         )
         return LogCorrupt(subject, found=found, expected=expected, remedy=remedy)

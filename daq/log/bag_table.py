@@ -210,8 +210,8 @@ class _Publisher:
 
 SEPARATE = (
     "no message has all fields, and messages of different publishers are not joined: write each "
-    "field to a CSV file, "
-    "with rows of the same instants, and name the files by `file` of `position` and `current`"
+    "field to a CSV file, with rows of the same instants, and name the files by `file` of "
+    "`position` and `current`"
 )
 FEWEST_OF_A_PUBLISHER = 10  #: Messages by which its rhythm is known
 #: Largest difference of a step from the usual one in an even row of stamps, as a share of it
@@ -370,8 +370,7 @@ class _Rows:
             is_full = {field for field, _ in self._columns} <= set(fullest.fields)
             choose = (
                 f"choose one in the import description, as in `publisher: {fullest.number}`, or "
-                "record again without "
-                "the others"
+                "record again without the others"
             )
             raise _unfit(
                 self._path,
@@ -459,12 +458,11 @@ class _Rows:
         raise _unfit(
             self._path,
             f"stamps of two publishers of the same joints: {found.first} messages each "
-            f"{found.first_step_s:.6g} s, and "
-            f"{found.second} messages each {found.second_step_s:.6g} s between them",
+            f"{found.first_step_s:.6g} s, and {found.second} messages each "
+            f"{found.second_step_s:.6g} s between them",
             "one publisher of each joint",
             "record again with one of the two nodes stopped, or give one of them another topic or "
-            "`frame_id`: then "
-            "`topic` or `publisher` of the import description chooses it",
+            "`frame_id`: then `topic` or `publisher` of the import description chooses it",
         )
 
     def _kept(self, part: KeptPart | None) -> slice:
@@ -517,8 +515,7 @@ class _Rows:
             f"nan for {', '.join(empty)} {at}",
             "numbers, but for the begin and the end of the bag",
             "samples are never invented: import what is before it and what is behind it by `keep`, "
-            "as recordings of "
-            "their own",
+            "as recordings of their own",
         )
 
     def _remarks(self, present: BoolArray, is_number: BoolArray, inside: slice) -> tuple[str, ...]:

@@ -254,8 +254,8 @@ class RecordFile:
     def _truncated(self, size: int, good: int | None) -> LogTruncated:
         return LogTruncated(
             str(self.path),
-            found=f"{size} bytes without the "
-            "closing mark" + ("" if good is None else f", whole records up to {good}"),
+            found=f"{size} bytes without the closing "
+            "mark" + ("" if good is None else f", whole records up to {good}"),
             expected="a finished log",
             remedy="the recorder was killed or the copy is incomplete: copy it again, or use "
             "`drivegain salvage`",

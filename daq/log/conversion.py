@@ -453,11 +453,9 @@ def check_limits(
                     key = "zero_offset_mm"
                 remedy = (
                     f"most likely the zero is wrong: moved by {least / unit.si:+.0f} to "
-                    f"{most / unit.si:+.0f} "
-                    f"{unit.name}, these positions are within the limits; correct `{key}` of "
-                    f"{axis.name} in the cell "
-                    "file, or the zero in the controller; else check motor or joint side, ratio "
-                    "and units"
+                    f"{most / unit.si:+.0f} {unit.name}, these positions are within the limits; "
+                    f"correct `{key}` of {axis.name} in the cell file, or the zero in the "
+                    "controller; else check motor or joint side, ratio and units"
                 )
             raise PositionImplausible(
                 f"{name}, axis {axis.name}",

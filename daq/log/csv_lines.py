@@ -379,8 +379,7 @@ class _Parts:
                     "rate without stamps",
                     expected="every sample, as `rate_hz` gives each row its time",
                     remedy="take the sign of the comment away, name a column of stamps by `time`, "
-                    "or import what is "
-                    "before it and what is behind it by `keep`",
+                    "or import what is before it and what is behind it by `keep`",
                 )
 
     def check_quotes(self, numbers: Sequence[int]) -> None:
@@ -512,8 +511,7 @@ def _require_row(file: CsvLines, row: int) -> None:
         found=f"{empty}{text[:SHOWN]!r}, a line that is no row of numbers",
         expected="rows of numbers alone, after the header",
         remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two "
-        "recordings, import what is "
-        f"before it by {parts}, and what is behind it by `from_row`",
+        f"recordings, import what is before it by {parts}, and what is behind it by `from_row`",
     )
 
 

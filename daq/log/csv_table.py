@@ -135,8 +135,7 @@ def _dates(file: CsvLines, time: TimeColumn) -> Stamps:
     expected = "a date and time with its zone, as 2026-03-01T08:00:00.004+01:00 or ...Z"
     remedy = (
         "correct `unit` of `time` in the import description, or add the zone to the file; `unit: "
-        "clock` reads times "
-        "without a zone"
+        "clock` reads times without a zone"
     )
     stamp_ns = _texts_ns(file, time, _date_ns, expected, remedy)
     seconds = np.array([1e-9 * date_ns for date_ns in stamp_ns])
@@ -331,9 +330,8 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
     if _ISO.fullmatch(text) or _CLOCK.fullmatch(text):
         return (
             "if this is the time, write `unit: clock` under `time` in the import description: a "
-            "time of day, without "
-            "a date and its zone, so that nothing is known of the order of runs; `unit: iso8601` "
-            "reads both"
+            "time of day, without a date and its zone, so that nothing is known of the order of "
+            "runs; `unit: iso8601` reads both"
         )
     return _remedy_for_a_line(file, row, text, values)
 
@@ -343,19 +341,17 @@ def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) 
     if file.names and file.fields(file.rows[row]) == list(file.names):
         before = file.first_row + row
         return (
-            "the header is there once more: import what is before it by "
-            f"`keep: {{to_row: {before}}}`, and what is behind it by `keep: {{from_row: "
-            f"{before + 2}}}`"
+            "the header is there once more: import what is before it by `keep: {to_row: "
+            f"{before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
         )
     if row == 0 and set(file.names).intersection(file.fields(file.rows[row])):
         return (
             "this is a second header, with the names in another order or with other names: nothing "
-            "says which of the "
-            "two is right; delete the wrong one from the file"
+            "says which of the two is right; delete the wrong one from the file"
         )
     if row == 0 and text.lower() not in MISSING and not any(np.isfinite(values[0])):
         return (
-            "if this line is no row (units, a second header), leave it out: "
-            f"`keep: {{from_row: {file.first_row + 2}}}` in the import description"
+            "if this line is no row (units, a second header), leave it out: `keep: {from_row: "
+            f"{file.first_row + 2}}}` in the import description"
         )
     return cut_advice(values, file.first_row)

@@ -147,9 +147,8 @@ def import_recording(
         of_holdout = samples.write(holdout, rows[first:])
         try:
             statistics = samples.write(out, rows[:first])
-        except (
-            BaseException
-        ):  # an interrupt, too: one log without the other would look like a whole import
+        # An interrupt, too: one log without the other would look like a whole import.
+        except BaseException:
             holdout.unlink()
             raise
     remarks = [remark for file in files.values() for remark in file.remarks]

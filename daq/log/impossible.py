@@ -202,8 +202,7 @@ def between_answers(joint_rad: FloatArray, answered: BoolArray) -> FloatArray:
 
 _GLITCH = (
     "record again, and check the encoder, its cable and the object that the drive sends; a counter "
-    "of fewer than 32 "
-    "bits that wraps is read as a step"
+    "of fewer than 32 bits that wraps is read as a step"
 )
 
 

@@ -257,6 +257,5 @@ def _foreign_beginning(path: Path, library: str) -> LogForeign | None:
         found=f"the begin of a bag of {library}, without a whole message",
         expected="a log of drivegain",
         remedy="the copy is incomplete, or its recorder was killed: copy it again, or repair it "
-        "with `mcap recover`; "
-        f"then `drivegain import` reads bags with {JOINTS_SCHEMA}",
+        f"with `mcap recover`; then `drivegain import` reads bags with {JOINTS_SCHEMA}",
     )

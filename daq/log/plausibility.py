@@ -167,8 +167,7 @@ def check_velocity(
             expected="velocities that agree with the positions to "
             f"{100.0 * velocity.tolerance:g} %",
             remedy="check `unit` and `side` of both, the order of their columns, and the rate or "
-            "the unit of the time; "
-            "or leave `velocity` out",
+            "the unit of the time; or leave `velocity` out",
         )
 
 
@@ -262,10 +261,8 @@ def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) ->
     if share < SLOW_SHARE:
         _LOG.warning(
             "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the "
-            "rate of the recording "
-            "right? A rate that is too low falsifies inertias without any other sign, and moves "
-            "that slow do not "
-            "identify them.",
+            "rate of the recording right? A rate that is too low falsifies inertias without any "
+            "other sign, and moves that slow do not identify them.",
             name,
             rate_hz,
             100.0 * share,
@@ -304,10 +301,8 @@ def check_steps(
         f"{section_place(wanted.position, files, row, found.axis)}, axis "
         f"{cell.axes[found.axis].name}",
         "cut the recording there, by `keep` of the import description, or export it again; a "
-        "column that wraps (at 360 "
-        "degrees, at a turn of the motor, as a counter) has to be made continuous; in a bag, do "
-        "two nodes publish the "
-        "same joints on the topic?",
+        "column that wraps (at 360 degrees, at a turn of the motor, as a counter) has to be made "
+        "continuous; in a bag, do two nodes publish the same joints on the topic?",
     )
 
 

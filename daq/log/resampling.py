@@ -193,8 +193,7 @@ def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
             "the recording",
             expected=f"one rate, to {100.0 * RATE_CHANGE:g} %",
             remedy="if these are times of arrival, give rate_hz instead of time; else import the "
-            "parts of one rate as "
-            "recordings of their own",
+            "parts of one rate as recordings of their own",
         )
 
 
@@ -254,8 +253,7 @@ def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArra
             remedy="were two recordings joined? import each by `keep` of the import description"
             if back_s
             else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of "
-            "time; in a bag, do "
-            "two nodes publish the same joints on the topic?",
+            "time; in a bag, do two nodes publish the same joints on the topic?",
         )
     return np.concatenate(([True], ~repeated))
 
@@ -275,7 +273,6 @@ def _check_gaps(
             expected=f"at most {wanted.largest_gap_periods:g} times the usual "
             f"{timing.usual_step_s:.6g} s",
             remedy="samples are missing: import the parts before and after it as two recordings, "
-            "by `keep`, or allow "
-            "the gap with `largest_gap_periods` of `time`; if these are times of arrival, give "
-            "rate_hz instead of time",
+            "by `keep`, or allow the gap with `largest_gap_periods` of `time`; if these are times "
+            "of arrival, give rate_hz instead of time",
         )

@@ -312,8 +312,7 @@ class LogWriter:
                     found="a file of that name, which was not there when the recording began",
                     expected="none",
                     remedy=f"nothing was replaced: the whole recording is {self.part}; give it "
-                    "another name without "
-                    f"{UNFINISHED}, or move the other file away",
+                    f"another name without {UNFINISHED}, or move the other file away",
                 ) from error
             self.part.rename(self.path)
         else:
@@ -371,8 +370,7 @@ class LogWriter:
         if self._keeps_part:
             remedy = (
                 "what was recorded until then stays in that file, which no fit reads (`drivegain "
-                "salvage` saves it); "
-                "free space and record again"
+                "salvage` saves it); free space and record again"
             )
         return OutputFailed(
             str(self.part),

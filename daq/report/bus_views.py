@@ -257,16 +257,14 @@ def scan_view(report: ScanReport) -> Iterator[RenderableType]:
     if any(node.in_fault for node in report.nodes):
         yield Text(
             "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the "
-            "last run (`drivegain "
-            "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; "
-            "nothing moves.",
+            "last run (`drivegain explain-emcy`) shows the cause. Remove it, then reset the fault "
+            "with --reset-faults; nothing moves.",
             "yellow",
         )
     yield from (Text(printable(text), "yellow") for text in (*report.mistyped, *report.warnings))
     if report.cell_fault:
         yield Text(
-            "The drives were found by the wiring alone; every other command refuses the "
-            "cell file: "
+            "The drives were found by the wiring alone; every other command refuses the cell file: "
             f"{printable(report.cell_fault)}",
             "yellow",
         )
@@ -375,8 +373,7 @@ def _foreign_verdict(home: WiredAxis | None) -> str:
 
 OTHER_DRIVE = (
     "this is another drive than the cell file describes, and `record` refuses it: check the "
-    "wiring; if the drive was "
-    "exchanged, enter its `identity` in the cell file and calibrate again"
+    "wiring; if the drive was exchanged, enter its `identity` in the cell file and calibrate again"
 )
 
 

@@ -296,8 +296,7 @@ class Certificate:
                 return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
                 return (
-                    f"Ready to be written: {count} change by more than noise, "
-                    f"{furthest}. Every "
+                    f"Ready to be written: {count} change by more than noise, {furthest}. Every "
                     "check passed."
                 )
         compared = "all agree with the nameplate"

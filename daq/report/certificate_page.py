@@ -279,8 +279,8 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     name = accepted_text(effect, calibration)
     size = size_text(effect, calibration)
     text = paragraph(
-        f"{effect.axis} has {name}: {size}. {data}, the model "
-        f"without it leaves {before} % of the torque of {effect.axis}, with it {after} %."
+        f"{effect.axis} has {name}: {size}. {data}, the model without it leaves {before} % of the "
+        f"torque of {effect.axis}, with it {after} %."
     )
     if effect.package is not None:
         text += paragraph(f"The effect {effect.name!r} is one of {effect.package}.")
@@ -347,9 +347,8 @@ def _old_comments(edit: FileEdit) -> Iterator[str]:
     if comments:
         axis, text = next(iter(comments.items()))
         yield paragraph(
-            "A write changes numbers only, so comments behind the gains may describe the "
-            "previous gains. "
-            f"{axis}: “{text}”."
+            "A write changes numbers only, so comments behind the gains may describe the previous "
+            f"gains. {axis}: “{text}”."
         )
 
 
@@ -455,9 +454,8 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
             "Dependence of the gains on the payload's mass",
             paragraph(
                 "To first order. A wrong mass is in every gain; where the mass is all that is "
-                "known of the payload, no "
-                "residual shows it. σ by the tolerance of the weighing is not included in σ of "
-                "the gains."
+                "known of the payload, no residual shows it. σ by the tolerance of the weighing is "
+                "not included in σ of the gains."
             ),
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
@@ -469,13 +467,10 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
         "Dynamic parameters",
         paragraph(
             "The number is that of the axis. I: moment of inertia of the link (Ia: of the motor), "
-            "m: its mass, mx, my, "
-            "mz: mass × centre of mass, fv: viscous friction, fs: dry friction, off: constant "
-            "torque, m in the middle "
-            "of a name (Iam, fvm, fsm): coupled motors, _loaded at its end: what is added while a "
-            "payload is mounted. "
-            "A sum is what motion shows of several links together; a name after a colon is "
-            "a payload."
+            "m: its mass, mx, my, mz: mass × centre of mass, fv: viscous friction, fs: dry "
+            "friction, off: constant torque, m in the middle of a name (Iam, fvm, fsm): coupled "
+            "motors, _loaded at its end: what is added while a payload is mounted. A sum is what "
+            "motion shows of several links together; a name after a colon is a payload."
         ),
         table("", ("parameter", "value ± σ", "unit"), value_rows(parameters), "stacked"),
     )
@@ -489,11 +484,9 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
     configuration = calibration.configuration_sha256 or "not known"
     software = calibration.software or "software not known"
     origin = (
-        f"Estimator {method}, {calibration.rows} rows, condition "
-        f"{calibration.condition:.0f}; on the data of the fit the model leaves {left} %. "
-        f"Calibration {certificate.origin.sha256}, configuration "
-        f"{configuration}, made {minute_text(calibration.created)} by "
-        f"{software}."
+        f"Estimator {method}, {calibration.rows} rows, condition {calibration.condition:.0f}; on "
+        f"the data of the fit the model leaves {left} %. Calibration {certificate.origin.sha256}, "
+        f"configuration {configuration}, made {minute_text(calibration.created)} by {software}."
     )
     yield folded(
         "Filters, logs and digests",

@@ -205,9 +205,9 @@ def fit_view(
     filter_ = fitted.identification.conditioning
     yield Sentence(
         f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, "
-        "condition "
-        f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
-        f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
+        f"condition {estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, "
+        f"decimation {filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the "
+        "same filters."
     )
     notes = (
         *sigma_notes(fitted),
@@ -251,8 +251,7 @@ def sigma_notes(fitted: Fit) -> Iterator[str]:
             apart = f"may differ by a factor of {ratio:.1f}"
     yield (
         f"σ rests on {counted(moves, 'move')} and is itself known to {100.0 * rough:.0f} % only: "
-        "that of another "
-        f"recording of the same plan {apart}."
+        f"that of another recording of the same plan {apart}."
     )
 
 
@@ -290,9 +289,8 @@ def paper_note(
     values = ", ".join(texts)
     return (
         f"The paper's total least squares, which is not used here, finds {values}. With noise "
-        "alone the two methods "
-        "agree better: an effect that the model lacks may bend these gains (`drivegain residual` "
-        "looks for it)."
+        "alone the two methods agree better: an effect that the model lacks may bend these gains "
+        "(`drivegain residual` looks for it)."
     )
 
 
@@ -438,20 +436,17 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
     ]
     mistake = (
         "These data do not show a wrong payload mass, or a wrong value of gravity: either scales "
-        "all gains alike and "
-        "leaves no residual."
+        "all gains alike and leaves no residual."
     )
     if drawn:
         mistake = (
             "These data hardly show a wrong payload mass: it changes all gains, and leaves a small "
-            "residual. A wrong "
-            "value of gravity leaves none."
+            "residual. A wrong value of gravity leaves none."
         )
         yield (
             f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong "
-            "by some per cent "
-            "shifts the gains by as much, which σ does not show: compare with --known mass, better "
-            "in the paper."
+            "by some per cent shifts the gains by as much, which σ does not show: compare with "
+            "--known mass, better in the paper."
         )
     masses = ""
     for text in mass_texts(influences):
@@ -487,8 +482,8 @@ def geometry_notes(
         if others:
             yield (
                 f"With the description as it is ({', '.join(others)} not corrected), the torques "
-                f"put gravity {size}: "
-                "its σ does not cover that, so correct it first, and fit again."
+                f"put gravity {size}: its σ does not cover that, so correct it first, and fit "
+                "again."
             )
         else:
             yield f"By the torques, gravity is {size}."
@@ -545,9 +540,8 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
     if error > DOUBTFUL_PERCENT:
         yield (
             f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ "
-            "does not cover "
-            "this error: check channels, signs, drive train, gravity and payload against the "
-            "cell file."
+            "does not cover this error: check channels, signs, drive train, gravity and payload "
+            "against the cell file."
         )
     elif not judged:
         yield f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better."

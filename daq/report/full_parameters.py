@@ -23,8 +23,8 @@ def full_parameter_view(calibration: Calibration, found: FullSet) -> Iterator[Re
     by_data = sum(one.basis == "data" for one in found.parameters)
     yield Sentence(
         f"{by_data} of {len(found.parameters)} parameters rest on the data; the others are the "
-        f"prior's, {found.urdf} "
-        f"with a tolerance of {100.0 * found.tolerance:g} %, as far as the data leave them free."
+        f"prior's, {found.urdf} with a tolerance of {100.0 * found.tolerance:g} %, as far as the "
+        "data leave them free."
     )
     if found.bounded:
         yield Sentence(
@@ -33,8 +33,7 @@ def full_parameter_view(calibration: Calibration, found: FullSet) -> Iterator[Re
     if found.contradictions:
         yield Sentence(
             f"CHECK the prior: {'; '.join(found.contradictions)}. What is marked `prior` is not to "
-            "be trusted: correct "
-            "the URDF, or give the tolerance that it has.",
+            "be trusted: correct the URDF, or give the tolerance that it has.",
             "bold",
         )
     elif found.mass_ratio is not None:

@@ -146,9 +146,8 @@ def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]
     if far:
         yield (
             f"The drive's own torque differs from the gain by more than {CERTAIN_SIGMAS:g} σ on "
-            f"{', '.join(far)}: a "
-            "wrong torque constant was entered in the drive, or the gear has losses, which the "
-            "drive does not see."
+            f"{', '.join(far)}: a wrong torque constant was entered in the drive, or the gear has "
+            "losses, which the drive does not see."
         )
 
 
@@ -206,14 +205,12 @@ def encoder_text(misfit: EncoderMisfit) -> str:
     if misfit.late_encoders:
         return (
             f"miss the loops by {described}{noise}, explained by {misfit.late_encoders}, which "
-            f"leaves {left}; the "
-            "gains are those of the described geometry"
+            f"leaves {left}; the gains are those of the described geometry"
         )
     if not misfit.corrections:
         return (
             f"miss the loops by {described}{noise}, which {UNEXPLAINED}; all zeros and lengths "
-            f"together leave {left}; "
-            "the gains are those of the described geometry"
+            f"together leave {left}; the gains are those of the described geometry"
         )
     texts = " and ".join(map(_correction_text, misfit.corrections))
     others = ""
@@ -224,8 +221,7 @@ def encoder_text(misfit: EncoderMisfit) -> str:
         used = "corrected"
     return (
         f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; "
-        "the gains are those "
-        f"of the {used} geometry"
+        f"the gains are those of the {used} geometry"
     )
 
 
@@ -272,8 +268,7 @@ def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
             share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
             text += (
                 f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, "
-                f"which is {at_most}"
-                f"± {share_percent:.2g} % of every gain, not included in σ"
+                f"which is {at_most}± {share_percent:.2g} % of every gain, not included in σ"
             )
         yield text
 

@@ -211,10 +211,9 @@ def _misdated_text(entry: Entry) -> str:
     """Say that a calibration was entered while the clock was wrong."""
     return (
         f"Calibration {entry.digest[:12]}…: found the date {entry.created_by_clock:%Y-%m-%d}; "
-        "expected one about "
-        f"{entry.created:%Y-%m-%d}, by the order of the audit log. The clock was wrong then, so it "
-        "is shown there. The "
-        "files keep their dates; gates judge the age of its logs by them."
+        f"expected one about {entry.created:%Y-%m-%d}, by the order of the audit log. The clock "
+        "was wrong then, so it is shown there. The files keep their dates; gates judge the age of "
+        "its logs by them."
     )
 
 
@@ -226,8 +225,7 @@ def show_axis(
     for noted in series.acknowledged:
         console.print(
             f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: "
-            f"{printable(noted.why)} "
-            f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
+            f"{printable(noted.why)} ({printable(noted.who)}, {noted.at:%Y-%m-%d})"
         )
     words = alarm_text(series)
     if words is not None:
@@ -415,8 +413,7 @@ def say_verification(found: Verification, console: Console) -> None:
     if not found.noted:
         console.print(
             f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of "
-            "the audit log would "
-            "not be noticed. The next entry writes it again."
+            "the audit log would not be noticed. The next entry writes it again."
         )
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
@@ -427,17 +424,15 @@ def say_verification(found: Verification, console: Console) -> None:
         begun = one.begun
         console.print(
             f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at "
-            f"{begun.at} was never "
-            f"ended; {printable(begun.subject)} was found {one.content.value}."
+            f"{begun.at} was never ended; {printable(begun.subject)} was found {one.content.value}."
         )
     for entry in verdict.entries:
         count = entry.details.get(BACKUPS_WITHOUT_LOG)
         if isinstance(count, int):
             console.print(
-                f"Entry {entry.number} began this audit log, although "
-                f"{printable(entry.subject)} had "
-                f"{counted(count, 'backup')} of earlier writes: an earlier log was removed "
-                "or moved."
+                f"Entry {entry.number} began this audit log, although {printable(entry.subject)} "
+                f"had {counted(count, 'backup')} of earlier writes: an earlier log was removed or "
+                "moved."
             )
     state = "sound"
     if not verdict.holds:

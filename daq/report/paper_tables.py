@@ -108,8 +108,8 @@ def parameter_table(
     rows.append(("‖ρ‖/‖Y‖", left, "", other_left, "", ""))
     mean = percent(_mean(differences))
     note = (
-        f"%e is the difference from the first value; its mean is {mean} %. "
-        f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units."
+        f"%e is the difference from the first value; its mean is {mean} %. R: other parameters are "
+        f"regrouped with this one. {NONE} for %σ: given. SI units."
     )
     return PaperTable(
         number=number,
@@ -167,8 +167,8 @@ def condition_table(found: CrossValidation) -> PaperTable:
         rows=(("cond(W)", *conditions),),
         notes=(
             "The smaller the number, the more evenly the moves show all base parameters. The "
-            "payload counts as part of "
-            "the last link. `plan` allows 3500, and 1e5 for a closed chain.",
+            "payload counts as part of the last link. `plan` allows 3500, and 1e5 for a closed "
+            "chain.",
         ),
     )
 
@@ -272,8 +272,7 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
         shown[shown.index(NAMEPLATE_LABEL)] = "nameplate"
     explanation = (
         f"Each column weighs with its own gains: {how}. Gains that find the right mass may still "
-        "be wrong, because "
-        "errors of several axes can cancel."
+        "be wrong, because errors of several axes can cancel."
     )
     return PaperTable(
         number=number,

@@ -139,8 +139,7 @@ def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
 
     yield (
         f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the "
-        "motors' joints are at "
-        f"{listed(robot.axis_joints)}."
+        f"motors' joints are at {listed(robot.axis_joints)}."
     )
 
 

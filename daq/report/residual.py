@@ -194,8 +194,6 @@ def effect_sizes(calibration: Calibration) -> Iterator[str]:
             rivals += f" and {more} more"
         if rivals:
             rivals = f"; not distinguishable from {rivals}"
-        else:
-            rivals = ""
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
 
 
@@ -300,8 +298,7 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
         # Its gains are right, although the cell file is not yet.
         checks.append(
             "The model corrects the description of the robot: gains and errors below are those of "
-            "the corrected one. "
-            "Correct the cell file all the same, and fit again."
+            "the corrected one. Correct the cell file all the same, and fit again."
         )
     found: list[str] = []
     for step, turn in zip(fitted.steps, account.turns, strict=True):
@@ -383,16 +380,14 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
         elif verdict.judgement is Judgement.CONFIRMED:
             yield (
                 f"Held-out runs confirm {name}, but it is not written: after other effects have "
-                "left, its σ no longer "
-                "shows it, or it left together with them."
+                "left, its σ no longer shows it, or it left together with them."
             )
         elif verdict.written:
             yield f"Undecided, and written because of --write-undecided: {name}: {evidence}."
         else:
             yield (
                 f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass "
-                "--write-undecided to "
-                "`drivegain residual`."
+                "--write-undecided to `drivegain residual`."
             )
 
 
@@ -415,9 +410,8 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     if last.after.effects and not is_judged_on_runs:
         sentences.append(
             "The effects were tested on moves of the same recordings only, kept out of the fit in "
-            "turn. Record two "
-            "runs without load and two with each payload: whole runs can then be kept out, which "
-            "is a stricter test."
+            "turn. Record two runs without load and two with each payload: whole runs can then be "
+            "kept out, which is a stricter test."
         )
     return tuple(sentences)
 
@@ -451,9 +445,8 @@ def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
         )
         yield (
             f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the "
-            "torque error is "
-            f"{errors[0]}{more}. Record more runs for the fit, or take `drivegain fit`, which adds "
-            "no effects."
+            f"torque error is {errors[0]}{more}. Record more runs for the fit, or take `drivegain "
+            "fit`, which adds no effects."
         )
 
 
@@ -487,8 +480,7 @@ def gains_sentence(fitted: Fit, account: Account) -> str:
     size = with_deviation(change.change_percent, change.change_std_percent, sign="+")
     return (
         f"The effects change no gain by {among_all}; the largest difference is {size} % of the "
-        f"gain of {axis} without "
-        "them."
+        f"gain of {axis} without them."
     )
 
 
@@ -543,18 +535,15 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
         replaced = rival is not None and rival in last.after.effects
         if rival is not None and rejected.moved and step is last:
             yield (
-                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends "
-                "clearly more on "
-                f"{variable_text(rival.effect, axes)}, and was not added: it would move "
+                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more "
+                f"on {variable_text(rival.effect, axes)}, and was not added: it would move "
                 f"{rejected.moved_text(axes)}."
             )
         elif step is last or (replaced and not is_unnamed(finding.effect)):
             yield (
                 f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error "
-                "of moves left out "
-                f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, "
-                "and was not "
-                f"added: {rejected.reason(axes)}."
+                f"of moves left out from {finding.error_before_percent:.1f} to "
+                f"{finding.error_after_percent:.1f} %, and was not added: {rejected.reason(axes)}."
             )
 
 
@@ -580,8 +569,7 @@ def _refused(fitted: Fit) -> Iterator[str]:
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
                 f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its "
-                "sign or size is "
-                f"impossible: {finding.impossible}. The cause may be another one."
+                f"sign or size is impossible: {finding.impossible}. The cause may be another one."
             )
             if strongest.get(axis) is finding:
                 strongest.pop(axis)
@@ -589,9 +577,8 @@ def _refused(fitted: Fit) -> Iterator[str]:
         name = finding.placed.axis_name(axes)
         yield (
             f"{name}: {effect_text(finding.effect, axes)} would explain "
-            f"{100.0 * finding.explained:.0f} % of the "
-            f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may "
-            "be another one."
+            f"{100.0 * finding.explained:.0f} % of the squared residual, but failed a check: "
+            f"{'; '.join(finding.refusals)}. The cause may be another one."
         )
 
 
@@ -622,9 +609,8 @@ def kinds_of_error(fitted: Fit) -> Iterator[str]:
     if names:
         yield (
             "The errors of a search are those of the motors' currents. `fit`, `validate` and the "
-            "certificate have "
-            "those of the joints' torques, which differ where several motors act on a joint "
-            f"({', '.join(names)})."
+            "certificate have those of the joints' torques, which differ where several motors act "
+            f"on a joint ({', '.join(names)})."
         )
 
 
@@ -650,8 +636,8 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
             when, causes = _FLOOR_CAUSES[floor.source]
             yield (
                 f"{axis} has no noise floor: its current {when} scatters "
-                f"{floor.noise_a / left_a:.1f} times "
-                f"as much as the model's error in motion. Possible causes: {causes}."
+                f"{floor.noise_a / left_a:.1f} times as much as the model's error in motion. "
+                f"Possible causes: {causes}."
             )
 
 
@@ -661,8 +647,7 @@ def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
     if fitted.accept_worse_holdout:
         yield (
             "The effects raise the error of the held-out runs by more than its noise. They were "
-            "accepted all the same, "
-            "because --accept-worse-holdout was given."
+            "accepted all the same, because --accept-worse-holdout was given."
         )
     else:
         yield (
@@ -684,10 +669,9 @@ def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
     delay_ms = 1e3 * abs(skew.seconds)
     std_ms = 1e3 * skew.std
     yield (
-        f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same "
-        f"on every axis ({standing}). Tenths of a millisecond are a filter of the drive, several "
-        "milliseconds "
-        "a fault of the recording: check its stamps."
+        f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same on "
+        f"every axis ({standing}). Tenths of a millisecond are a filter of the drive, several "
+        "milliseconds a fault of the recording: check its stamps."
     )
 
 
@@ -696,15 +680,13 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
     if skew is None:
         yield (
             "A time skew between currents and positions is not known: it needs instruments, so "
-            "point-to-point "
-            "moves and one motor for each degree of freedom, and data that show it beside "
-            "the model."
+            "point-to-point moves and one motor for each degree of freedom, and data that show it "
+            "beside the model."
         )
     elif not skew.confirmed:
         yield (
             "A time skew between currents and positions is not confirmed: instruments from the "
-            "demanded motion give "
-            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
+            f"demanded motion give {1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
         )
 
 
@@ -739,10 +721,9 @@ def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str
             share = 1.0 - gear.motoring_torque
         yield (
             f"The gain of {name} includes the efficiency of its gear: the {side} drives in "
-            f"{100.0 * share:.0f} % of "
-            f"the squared load torque. A loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % "
-            "would not show, and "
-            f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
+            f"{100.0 * share:.0f} % of the squared load torque. A loss of up to "
+            f"{100.0 * CERTAIN * gear.loss_std:.1f} % would not show, and would change the gain by "
+            f"{100.0 * gear.hidden_shift:.1f} %."
         )
 
 
@@ -851,8 +832,7 @@ def _effect_sentence(
         whose = name
     noise = _noise_text(account, placed.axis)
     return (
-        f"{name} has {what}: the error of {whose} {where} "
-        f"{error_change_text(without, with_it)} "
+        f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} "
         f"({noise})."
     )
 
@@ -876,8 +856,7 @@ def _hardly_shown_text(
         certain = f", by {sigmas:.0f} σ"
     text = (
         f"{certain}: it hardly shows in the error of all axes {where}, {before.total:.2f} % "
-        "without it and "
-        f"{after.total:.2f} % with it"
+        f"without it and {after.total:.2f} % with it"
     )
     names = fitted.cell.axis_names
     falls = {}
@@ -938,8 +917,7 @@ def _silence(fitted: Fit) -> str:
     if last.accepted is not None:
         return (
             f"The search ended after {MAX_EFFECTS} effects with more to find: check the declared "
-            "model first "
-            "(drive train, payload, channels)."
+            "model first (drive train, payload, channels)."
         )
     axis_limits = []
     for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True):
@@ -955,6 +933,5 @@ def _silence(fitted: Fit) -> str:
         unseen = " The runs have no common clock: a warm-up over the session cannot be seen."
     return (
         f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean "
-        "square in motion: "
-        f"{limits}.{unseen}"
+        f"square in motion: {limits}.{unseen}"
     )

@@ -243,8 +243,7 @@ class ResidualFile(ResidualReport, ResidualFormat):
 
 _METRIC = (
     "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w "
-    "the gains of the "
-    "declared model"
+    "the gains of the declared model"
 )
 
 

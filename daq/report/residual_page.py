@@ -160,16 +160,12 @@ def _errors(fitted: Fit, account: Account) -> str:
         cells = map(percent_text, (*error.axes, error.total))
         rows.append((name, *cells))
     explanation = (
-        "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows "
-        "in motion; "
-        "in total with each current weighted by its gain. Compare errors only under the same "
-        "filters (end "
-        "of this page). Noise, estimate: what the current's noise alone would leave, as measured "
-        "at standstill "
-        "or between repeated moves, whichever is smaller, and at most the error. Noise, at least: "
-        "its lower "
-        "limit at 95 % confidence, where moves were repeated: in 19 of 20 cases no model's error "
-        "is smaller."
+        "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in "
+        "motion; in total with each current weighted by its gain. Compare errors only under the "
+        "same filters (end of this page). Noise, estimate: what the current's noise alone would "
+        "leave, as measured at standstill or between repeated moves, whichever is smaller, and at "
+        "most the error. Noise, at least: its lower limit at 95 % confidence, where moves were "
+        "repeated: in 19 of 20 cases no model's error is smaller."
     )
     return folded(
         "Errors without and with the effects",
@@ -240,9 +236,8 @@ def _effect(
     drawings = draw_effect(before, step.after, placed, fitted.cell)
     variable = f"{variable_text(placed.effect, axes)}{of_joint}"
     explanation = (
-        f"Residual of {shown_axis} over time and against {variable}, without "
-        "and with the effect. A mean away from zero is torque that the model still lacks. Gaps: "
-        "samples left out."
+        f"Residual of {shown_axis} over time and against {variable}, without and with the effect. "
+        "A mean away from zero is torque that the model still lacks. Gaps: samples left out."
     )
     return folded(
         f"{axis}: {effect_text(placed.effect, axes)}",
@@ -300,10 +295,8 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
         caption = (
             "Candidates by how much they reduce the error of left-out moves. Full: passed every "
-            "check. Pale: these "
-            "data cannot distinguish it from the added one. Hollow: failed a check. The scale "
-            "counts the squared "
-            "noise of one sample as 1."
+            "check. Pale: these data cannot distinguish it from the added one. Hollow: failed a "
+            "check. The scale counts the squared noise of one sample as 1."
         )
         ranking = figure(plot_ranking(ranked, rivals, axes), caption)
     sentences = list(turn_sentences(fitted, step))
@@ -326,8 +319,8 @@ def _limits(fitted: Fit, calibration: Calibration) -> str:
     limits = [
         *identifiability_notes(fitted, calibration.payload_mass),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect "
-        "that is the same at "
-        "every speed, load and position is part of the parameters: neither leaves a residual.",
+        "that is the same at every speed, load and position is part of the parameters: neither "
+        "leaves a residual.",
     ]
     if fitted.estimate.gains_fixed:
         limits.append("The gains were held: an error in them is hidden in the parameters.")
@@ -335,13 +328,10 @@ def _limits(fitted: Fit, calibration: Calibration) -> str:
         "Backlash or elasticity behind an encoder on the motor may leave no trace in "
         "these signals.",
         "An effect is named after the variable it depends on and the shape of that dependence; "
-        "another cause with the "
-        "same dependence would get the same name. Indistinguishable effects are listed with "
-        "each effect.",
+        "another cause with the same dependence would get the same name. Indistinguishable effects "
+        "are listed with each effect.",
         "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller "
-        "or larger. Between "
-        "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: "
-        "an error above it "
-        "need not be an effect.",
+        "or larger. Between repeated moves its lower limit bounds any model's error (95 % "
+        "confidence), often loosely: an error above it need not be an effect.",
     ]
     return folded("What these data can and cannot show", html_list(limits))

@@ -105,8 +105,7 @@ def urdf_view(
         shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
         yield (
             "No physical robot has exactly the identified parameters; the torque of this one "
-            "differs by "
-            f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
+            f"differs by {change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
         )
     if robot.prior.assumed:
         joints = robot.parameters.model.robot.joints
@@ -134,9 +133,8 @@ def urdf_view(
     if corrected:
         text = (
             "CHECK the description: the bodies are those of the robot as corrected by "
-            f"{', '.join(corrected)}, and the "
-            "joints of this URDF are as they were described. Correct the cell file, fit the logs "
-            "again, then export."
+            f"{', '.join(corrected)}, and the joints of this URDF are as they were described. "
+            "Correct the cell file, fit the logs again, then export."
         )
         yield Text(printable(text), style="bold")
     if same_configuration is False:

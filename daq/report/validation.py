@@ -162,8 +162,8 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     filter_ = conditioning_of(calibration)
     yield Sentence(
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation "
-        f"{filter_.decimation_cutoff_hz:g} Hz, as in the "
-        "fit. Compare relative errors only under the same filters."
+        f"{filter_.decimation_cutoff_hz:g} Hz, as in the fit. Compare relative errors only under "
+        "the same filters."
     )
     yield from (Sentence(doubt, "bold") for doubt in _doubts(calibration, found))
     for paper_table in validation_tables(found, complete=False):
@@ -188,8 +188,8 @@ def _doubts(calibration: Calibration, found: CrossValidation) -> Iterator[str]:
         if validation.error.total > DOUBTFUL_PERCENT:
             yield (
                 f"{validation.run} contradicts the calibration: it leaves "
-                f"{validation.error.total:.3g} % of the torque."
-                " Was the payload mounted as the log says, and is it the same robot?"
+                f"{validation.error.total:.3g} % of the torque. Was the payload mounted as the log "
+                "says, and is it the same robot?"
             )
     yield from (f"{run.run}: {run.left_out}" for run in found.runs if run.left_out)
 

@@ -174,8 +174,7 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
         if any(np.isfinite(body.std) & ~body.identifiable):
             yield (
                 f"Not identifiable with a σ: it is more than {100 * KNOWN:.0f} % of the value, and "
-                "2 σ is more than a "
-                "steel cube of the least mass (m − 2 σ) has."
+                "2 σ is more than a steel cube of the least mass (m − 2 σ) has."
             )
     if not nothing:
         # Below the table: in its rows they would push σ and unit off a terminal of 80 columns.
@@ -249,8 +248,7 @@ def _doubts(found: Weighed) -> Iterator[str]:
     if body.error.total > DOUBTFUL_PERCENT:
         yield (
             f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. "
-            "Is it the same "
-            "robot, and one body mounted one way?"
+            "Is it the same robot, and one body mounted one way?"
         )
     is_known = not _shows_nothing(body) and not np.isnan(body.values).any()
     if is_known and _smallest_pseudo_inertia(body) < 0.0:
@@ -352,9 +350,8 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         source = f"this log less {stretches} far out"
     yield (
         f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false "
-        "alarm in an hour of "
-        "motion like that, all axes together, on average and from five quiet minutes on. "
-        "Standstill is not judged."
+        "alarm in an hour of motion like that, all axes together, on average and from five quiet "
+        "minutes on. Standstill is not judged."
     )
     contacts = found.contacts
     missing = not_judged(found, cell)
@@ -405,8 +402,7 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
         else:
             reasons[axis] = (
                 f"its residual stays on one side for {correlation_s:.2g} s at a time, with too few "
-                "separate peaks; "
-                "a temperature may be missing, or a body undeclared"
+                "separate peaks; a temperature may be missing, or a body undeclared"
             )
     return reasons
 

@@ -514,8 +514,7 @@ def _beside_alike(
         found=f"either {found}: these moves do not tell them apart",
         expected=" and ".join(expected),
         remedy=f"record {wanted}, and fit them together with these; or measure which of them is "
-        "wrong; correct nothing "
-        "in the cell file before that",
+        "wrong; correct nothing in the cell file before that",
     )
 
 
@@ -567,8 +566,7 @@ def drift_diagnosis(
     if is_given:
         remedy = (
             "the given cell file has another number here than the description in the log: correct "
-            "the cell file, or "
-            f"if it is right, {remedy}"
+            f"the cell file, or if it is right, {remedy}"
         )
     return _diagnosis_of(placed, name, runs, found, expected, remedy)
 
@@ -617,29 +615,25 @@ def _correction_diagnosis(
             expected = ONE_MOMENT
             remedy = (
                 "look for what delays this encoder alone: a filter, a slower channel, another time "
-                "stamp than that of "
-                "the other axes"
+                "stamp than that of the other axes"
             )
         case Lag():
             found = f"the current of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
             remedy = (
                 "look for what delays this current alone: a filter of its drive, a slower channel, "
-                "another time stamp "
-                f"than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
+                f"another time stamp than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
             )
         case TimeSkew():
             found = (
-                f"all currents {_late_text(values, deviations)} beside the positions, "
-                "the same "
-                "on every axis"
+                f"all currents {_late_text(values, deviations)} beside the positions, the same on "
+                "every axis"
             )
             expected = ONE_MOMENT
             remedy = (
                 "no single encoder or drive is late: check how positions and currents are stamped "
-                "(two messages of one "
-                "cycle, two clocks, a filter that every drive has) and record again; "
-                f"{SMALL_DELAY} of the recording; {INTO_THE_MODEL}"
+                "(two messages of one cycle, two clocks, a filter that every drive has) and record "
+                f"again; {SMALL_DELAY} of the recording; {INTO_THE_MODEL}"
             )
         case _:
             declared = model.robot.gravity_m_s2

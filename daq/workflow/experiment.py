@@ -286,8 +286,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
             found="none" if payload is None else f"no payload {payload!r}",
             expected=", ".join(declared.name for declared in cell.payloads) or "a weighed payload",
             remedy="gains show only beside a known mass: give a declared name, or weigh a body and "
-            "declare it under "
-            "`payloads`",
+            "declare it under `payloads`",
         )
     mounted = found[0]
     model = model_of(cell)
@@ -303,8 +302,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
         f"masses of the links: {'from the URDF' if from_urdf else 'guessed'}",
         f"noise: {100 * NOISE_SHARE:g} % of each motor's current at its torque limit, correlation "
-        f"{LAG_ONE:g} from row "
-        "to row",
+        f"{LAG_ONE:g} from row to row",
         *scene.remarks,
     )
     design = Design(expectation, visible_base(model, fast_motion))
@@ -340,8 +338,8 @@ def _effort_remarks(
             masses = "guessed masses of the links"
         lines.append(
             f"torque limits: with {masses}, gravity alone asks more than the `effort` of "
-            f"{', '.join(refuted)} in the "
-            "URDF; not kept there. Correct `effort` or the masses; the planner knows no balancer"
+            f"{', '.join(refuted)} in the URDF; not kept there. Correct `effort` or the masses; "
+            "the planner knows no balancer"
         )
     return tuple(lines)
 

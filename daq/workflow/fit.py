@@ -762,8 +762,7 @@ def check_holdout(fitted: Fit) -> None:
         expected=f"no rise by more than its noise over their {change.total.moves} independent "
         f"blocks of moves; {harm}",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record "
-        "more runs for "
-        "the fit (or pass --accept-worse-holdout to `drivegain residual`)",
+        "more runs for the fit (or pass --accept-worse-holdout to `drivegain residual`)",
     )
 
 
@@ -820,7 +819,7 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     unseen = final.holdout
     if unseen is None or final.estimate.gains_fixed:
         return None
-    # Tls corrects gains
+    # TLS estimates gains and cannot hold them: ML takes its place.
     method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method
     try:
         held = estimate_with(method, final.system, nameplate_of(fitted.cell))

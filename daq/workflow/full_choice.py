@@ -110,8 +110,7 @@ def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:
         different = sorted(set(by_name) ^ set(names))
         raise ModelError(
             f"full_parameters of the calibration are of another robot: {', '.join(different)} in "
-            "one of the two only; "
-            "use the cell of the fit"
+            "one of the two only; use the cell of the fit"
         )
     standard = np.array([by_name[name].value for name in names])
     return standard, np.array([by_name[name].prior_share for name in names])

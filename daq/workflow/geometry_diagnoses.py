@@ -23,18 +23,18 @@ from ident.model.robot import JointKind
 if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
     from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 
+#: Diagnoses of one cause.
 NAMES = {
     GeometryKind.ZERO: "zero-off",
     GeometryKind.LENGTH: "length-off",
     GeometryKind.PLACE: "place-off",
     GeometryKind.DELAY: "position-late",
-}  #: Diagnoses of one cause
+}
 SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
 UNEXPLAINED = "no zero, length, place on the base or late encoder explains, nor any three of them"
 LOOK_FOR = (
     "look for arms that bend, play in joints, encoders that do not count evenly, and more than "
-    "three wrong numbers; "
-    "measure zeros, lengths and places, and correct cell file and URDF"
+    "three wrong numbers; measure zeros, lengths and places, and correct cell file and URDF"
 )
 MM = 1e-3  #: [m]
 MS = 1e-3  #: [s]
@@ -185,8 +185,7 @@ def _remedy(one: GeometryEstimate, cell: Cell) -> str:
         case GeometryKind.DELAY:
             return (
                 f"look for what delays the encoder of {_axis_of(one.parameter, cell).name} alone: "
-                "a filter, a slower "
-                "channel, another time stamp than that of the other axes"
+                "a filter, a slower channel, another time stamp than that of the other axes"
             )
 
 

@@ -165,6 +165,5 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         found=found,
         expected=expected,
         remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then "
-        "start again; a job "
-        "goes on where it ended",
+        "start again; a job goes on where it ended",
     )

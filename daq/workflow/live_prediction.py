@@ -238,8 +238,7 @@ def predictor_of(
         if run.rate_hz < 2.0 * (passed_hz := conditioning_of(calibration).position_cutoff_hz):
             return None, (
                 f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and "
-                "acceleration; the "
-                f"fit's filter passes {passed_hz:g} Hz"
+                f"acceleration; the fit's filter passes {passed_hz:g} Hz"
             )
         found = Predictor(calibration, cell, payload, run.rate_hz)
     except (DaqError, IdentificationError) as error:

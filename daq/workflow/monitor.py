@@ -102,7 +102,7 @@ class CellWatch:
         )
         self._ampere: list[float | None] = [None] * len(network.axes)
         self._events: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
-        # Which other events do not displace
+        # Kept apart, so that other events do not displace them.
         self._alarms: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
         self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet
         self._lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP

@@ -143,8 +143,7 @@ def actual_current_note(cell: Cell) -> str | None:
     )
     return (
         f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} "
-        "reports none): the "
-        "gains are Nm per A of actual current"
+        "reports none): the gains are Nm per A of actual current"
     )
 
 
@@ -166,8 +165,7 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
         key = next(key for key in keys if key.startswith("nameplate_gain"))
         found = (
             f"{axis.nameplate_gain:g} {axis.gain_unit}, while {reference.name} is "
-            f"{reference.gain:.4g} "
-            f"({reference.source})"
+            f"{reference.gain:.4g} ({reference.source})"
         )
         faults.append(
             Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}")
@@ -175,8 +173,7 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
     raise ConfigurationInconsistent(
         **fault_texts(document, faults),
         remedy="correct the nameplate, the gear ratio or the other number: is one of them in "
-        "another unit (mA, mNm), "
-        "on the motor's side, or of another axis?",
+        "another unit (mA, mNm), on the motor's side, or of another axis?",
     )
 
 

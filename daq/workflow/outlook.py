@@ -27,11 +27,9 @@ HELP = {
     SlowCause.NOISE: "find what disturbs the current of {axis}: its channel, its cable, or the "
     "tuning of its loop",
     SlowCause.INERTIA: "give {axis} more speed and acceleration in the cell file, or mount a body "
-    "whose mass lies "
-    "farther from its axis",
+    "whose mass lies farther from its axis",
     SlowCause.COUPLING: "mount a body that loads {axis} more: a heavier one, or one whose mass "
-    "lies farther from its "
-    "axis",
+    "lies farther from its axis",
     SlowCause.TIME: "",
 }
 """What makes σ of a gain fall faster, beside more time."""

@@ -690,10 +690,8 @@ def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -
     exact = "1.5707963267948966 for a quarter turn, 3.141592653589793 for a half"
     return (
         f"the URDF turns {', '.join(turned)} by nearly a right angle, as rounded numbers do "
-        "(1.5708): parameters that "
-        f"an exact angle hides are nearly invisible then. Write {exact}. If these angles are "
-        "measured ones, "
-        "`--condition` accepts more"
+        f"(1.5708): parameters that an exact angle hides are nearly invisible then. Write {exact}. "
+        "If these angles are measured ones, `--condition` accepts more"
     )
 
 
@@ -875,8 +873,7 @@ def save_plan(plan: Plan, path: Path) -> None:
         )
         lines.append(
             f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: "
-            f"{move.acceleration:.4f}, "
-            f"dwell_s: {move.dwell_s:.3f}}}"
+            f"{move.acceleration:.4f}, dwell_s: {move.dwell_s:.3f}}}"
         )
     replace_file(path, ("\n".join(lines) + "\n").encode())
 
@@ -1015,10 +1012,8 @@ def way_to_first_target(
     if turns is None:
         raise MotionRefused(
             f"the way from here to the first target of the plan: found {_spell(cell, blocked)}, "
-            "and no other clear way "
-            "between the positions of the plan; bring the robot near the first target by hand, "
-            "or correct "
-            f"{_keys(blocked)} in the cell file"
+            "and no other clear way between the positions of the plan; bring the robot near the "
+            f"first target by hand, or correct {_keys(blocked)} in the cell file"
         )
     slow = replace(
         first,
@@ -1045,9 +1040,8 @@ def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) 
     found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, "
-            "or correct "
-            f"{_keys(found)} in the cell file"
+            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, or "
+            f"correct {_keys(found)} in the cell file"
         )
 
 

@@ -502,8 +502,8 @@ def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
             f"axes that are UNGUARDED: {'; '.join(network.unguarded())}",
             expected="that every axis watches the recorder's heartbeat (1016h)",
             remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the "
-            "same, with a hand at the "
-            "emergency stop; a scheduled job needs `policy: {unguarded: allowed}` in the cell file",
+            "same, with a hand at the emergency stop; a scheduled job needs `policy: {unguarded: "
+            "allowed}` in the cell file",
         )
 
 

@@ -281,8 +281,7 @@ def warn_of_corrections(calibration: Calibration, name: str, configuration_sha25
     if corrected:
         _LOG.warning(
             "%s has another description of the cell than the fit, which the calibration corrects "
-            "(%s): if the cell "
-            "file was corrected since, calibrate anew",
+            "(%s): if the cell file was corrected since, calibrate anew",
             name,
             ", ".join(corrected),
         )

@@ -239,8 +239,7 @@ class DriveTarget:
                 found="no objects in the drives",
                 expected="the object of each axis's gain",
                 remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: "
-                "...}, ...]}` to the "
-                "cell file, one for each axis (docs/how-to/write-gains.md)",
+                "...}, ...]}` to the cell file, one for each axis (docs/how-to/write-gains.md)",
             )
         require_axes(calibration, self.cell.axis_names)
         gains = {gain.axis: gain for gain in calibration.gains}
@@ -431,9 +430,8 @@ def _change(
                 key,
                 found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
                 expected="a rounding below σ",
-                remedy="this object is too coarse for the gain: use another one, or another "
-                "factor in "
-                "`controller.objects`; nothing was written",
+                remedy="this object is too coarse for the gain: use another one, or another factor "
+                "in `controller.objects`; nothing was written",
             )
         planned = (held / factor, f"{held:.9g}")
     return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(

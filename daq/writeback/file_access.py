@@ -83,8 +83,8 @@ def require_existing(file: Path) -> None:
             found=f"a file with {names} names (hard links)",
             expected="one name: under the others the current gains would stay",
             remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of "
-            "them, or give this name "
-            f"a file of its own: cp -p {quoted} {quoted}.new && mv {quoted}.new {quoted}",
+            f"them, or give this name a file of its own: cp -p {quoted} {quoted}.new && mv "
+            f"{quoted}.new {quoted}",
         )
 
 
@@ -142,8 +142,7 @@ class Backup:
                 found=f"{len(content)} bytes with SHA-256 {short_digest(content)}…",
                 expected=f"{self.was}…, as its name says",
                 remedy="this backup was changed after it was made, and nothing was restored; if "
-                "its gains are right, "
-                "copy it over the controller file by hand",
+                "its gains are right, copy it over the controller file by hand",
             )
         return content
 

@@ -314,8 +314,8 @@ def _changed_since_recording(
         if recorded is not None and recorded != base_sha256:
             remedy = (
                 "the file was changed since, by hand or by an earlier write: review its gains and "
-                "the diff of this dry "
-                f"run, and where both are right, repeat it with --base {base_sha256}"
+                "the diff of this dry run, and where both are right, repeat it with --base "
+                f"{base_sha256}"
             )
             expected = f"{recorded[:12]}…, as when {log.name} was recorded"
             return ((file, f"content {base_sha256[:12]}…", expected, remedy),)

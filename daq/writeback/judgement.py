@@ -87,8 +87,7 @@ def query_history(
     if history.renamed is not None:
         _LOG.warning(
             "cell %r was renamed to %r at %s: its history is under that name, so the current gains "
-            "are taken as exact; "
-            "give the cell file with the new name",
+            "are taken as exact; give the cell file with the new name",
             cell.name,
             history.renamed.new,
             history.renamed.at,
@@ -157,7 +156,6 @@ def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
         whose = "all axes" if len(exact) == len(changes) else listed
         taken = f"the {exact[0].compared_with.value} is taken as exact on {whose}"
     return (
-        "more than noise: the probability that noise alone makes such a change, on any axis, "
-        "is below "
-        f"{100 * FALSE_ALARM:g} %; {taken}"
+        "more than noise: the probability that noise alone makes such a change, on any axis, is "
+        f"below {100 * FALSE_ALARM:g} %; {taken}"
     )

@@ -159,9 +159,8 @@ def parse_signature(text: str) -> Signature:
     Raises:
         ValueError: it is none, or not a prehashed one.
     """
-    lines = (
-        text.replace("\r\n", "\n").removesuffix("\n").split("\n")
-    )  # line ends of a mail or of Windows are not signed
+    # Line ends of a mail or of Windows are not signed.
+    lines = text.replace("\r\n", "\n").removesuffix("\n").split("\n")
     shaped = (
         len(lines) == _SIGNATURE_LINES
         and lines[0].startswith(UNTRUSTED)
@@ -175,8 +174,8 @@ def parse_signature(text: str) -> Signature:
     algorithm, key_id, signature = _SIGNATURE.unpack(packed)
     if algorithm != _PREHASHED:
         raise ValueError(
-            f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign "
-            "-S -H` makes it)"
+            f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign -S -H` makes "
+            "it)"
         )
     whole = decode_line(lines[3], 64, "the signature of the trusted comment")
     return Signature(key_id, signature, lines[2].removeprefix(TRUSTED), whole)

@@ -280,8 +280,8 @@ def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
         return {}
     _LOG.warning(
         "%s is absent, although %s has %s of earlier writes beside it: a new audit log begins with "
-        "this write, and "
-        "says so; if the old one was not moved on purpose, restore it and ask who removed it",
+        "this write, and says so; if the old one was not moved on purpose, restore it and ask who "
+        "removed it",
         recorder.audit,
         subject,
         counted(count, "backup"),
@@ -338,8 +338,7 @@ def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
         "`drivegain history CELL --add CALIBRATION` enters it, `drivegain rollback CELL` undoes it"
     )
     asking = (
-        f"whether {edit.subject} has the new content is not known: compare it with "
-        "the newest "
+        f"whether {edit.subject} has the new content is not known: compare it with the newest "
         "backup beside it"
     )
     return OutputFailed(

@@ -292,8 +292,7 @@ class SocketcandBus(BurstBus):
                 shown = match.group()[:_SHOWN].decode("ascii")
                 raise can.CanOperationError(
                     f"{self.channel_info}: a frame of {len(identifier)} digits of identifier and "
-                    f"{len(data)} of data: "
-                    f"{shown}"
+                    f"{len(data)} of data: {shown}"
                 )
             self._received.append(
                 can.Message(
@@ -310,9 +309,8 @@ class SocketcandBus(BurstBus):
 
     def _endless(self, buffer: bytes) -> str:
         return (
-            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, "
-            "beginning with "
-            f"{buffer[:_SHOWN]!r}: is this a socketcand server?"
+            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, beginning "
+            f"with {buffer[:_SHOWN]!r}: is this a socketcand server?"
         )
 
     def shutdown(self) -> None:

@@ -235,9 +235,8 @@ class Capture:
                     ended = True
             elif not ready:
                 self._empty_ns = self._now_ns = time.monotonic_ns()
-                self._note(
-                    RecordKind.LOSSES
-                )  # the parent distinguishes a silent bus from a capture process that was stopped
+                # The parent distinguishes a silent bus from a capture process that was stopped.
+                self._note(RecordKind.LOSSES)
                 # A frame reports the drops before it, and there may be none: ask the socket itself.
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)

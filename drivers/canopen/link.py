@@ -346,8 +346,7 @@ class Link:
             # CiA 301: codes 00xxh report the end of an error.
             kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
             text = (
-                f"EMCY {code:04X}h {describe_error_code(code)}, error register "
-                f"{register:02X}h, "
+                f"EMCY {code:04X}h {describe_error_code(code)}, error register {register:02X}h, "
                 f"data {data.hex()}"
             )
             self._events.append((node_id, kind, code, text))

@@ -140,9 +140,9 @@ def open_cell(
 
 
 class CanopenNetwork:
-    """The axes of a cell.
+    """The axes of a cell, as a context manager.
 
-    Use as a context manager; leaving it disables all axes and restores all settings.
+    Leaving it disables all axes and restores all settings.
 
     Methods that use the bus raise BusError when it is lost, and ObjectAccessError when an axis does
     not answer.
@@ -282,8 +282,7 @@ class CanopenNetwork:
                 raise SetupRefused(
                     axis,
                     f"{differing[0]}; was an amplifier exchanged? correct the configuration only "
-                    "after checking the "
-                    "hardware",
+                    "after checking the hardware",
                 )
         return identities
 
@@ -407,8 +406,7 @@ class CanopenNetwork:
         raise BusBusy(
             str(self.link.address),
             "no free node id for the recorder: all of 1 to 127 belong to axes or other devices, or "
-            "an axis waits for "
-            "them (1016h)",
+            "an axis waits for them (1016h)",
             "an id that only the recorder uses, because another device's heartbeat would keep the "
             "axes running",
             "nothing has moved; take one of the other devices off the bus while recording",
@@ -510,10 +508,8 @@ class CanopenNetwork:
                 raise SetupRefused(
                     axis,
                     f"object {entry} is {by_sdo} by SDO and {by_pdo} in its PDO at standstill, "
-                    "expected at most "
-                    f"{STANDSTILL_COUNTS} apart; another device sends with this COB-ID, or the "
-                    "mapping is not what it "
-                    "reads back as",
+                    f"expected at most {STANDSTILL_COUNTS} apart; another device sends with this "
+                    "COB-ID, or the mapping is not what it reads back as",
                 )
 
     def _command_all(self, command: NmtCommand, state: NmtState) -> None:

@@ -156,9 +156,8 @@ def write_parameters(
         for axis in network.axes:
             _require_powerless(network, axis)
         network.link.require_alone()
-    except (
-        BaseException
-    ) as error:  # an interrupt too: a cell with half of the new gains has no valid set
+    # An interrupt too: a cell with half of the new gains has no valid set.
+    except BaseException as error:
         with network.block_signals():
             _undo(network, tried, saved, error)
         raise
@@ -207,8 +206,7 @@ def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> N
         raise ParameterRefused(
             write.axis,
             f"object {write.parameter} reads back as {read}, written was {written}; does the drive "
-            "limit or round it, "
-            "or is it another object?",
+            "limit or round it, or is it another object?",
         )
 
 
@@ -229,8 +227,8 @@ def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
         raise ParameterRefused(
             axis,
             f"{state} (statusword {statusword:#06x}): its power stage is not off, and no parameter "
-            "is written while it "
-            "is on; disable the axes with the controller that enabled them, then try again",
+            "is written while it is on; disable the axes with the controller that enabled them, "
+            "then try again",
         )
 
 

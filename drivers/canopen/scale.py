@@ -62,8 +62,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
         if value <= 0:
             remedy = (
                 "the drive was not set up for its motor, so its current has no scale: enter the "
-                "motor's rated current "
-                "and torque in the drive"
+                "motor's rated current and torque in the drive"
             )
             raise implausible(f"{name} = {value}", "the motor's rated value", remedy)
     choice = 0 if scale.switch is None else access.read(scale.switch)
@@ -118,8 +117,8 @@ def check_nameplate(
     ratio = reported / declared
     evidence = (
         f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / "
-        f"{reading.rated_current_a:g} A), "
-        f"{declared:.4g} Nm/A by the nameplate in the cell file, {ratio:.3g} times"
+        f"{reading.rated_current_a:g} A), {declared:.4g} Nm/A by the nameplate in the cell file, "
+        f"{ratio:.3g} times"
     )
     if 1.0 / FINE < ratio < FINE:
         return ()

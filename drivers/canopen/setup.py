@@ -62,14 +62,12 @@ MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
 
 HEARTBEATS_NEEDED = (
     "its NMT state and its loss would not be known without heartbeats, and node guarding (100Ch) "
-    "is not supported: use "
-    "a firmware of the drive that has heartbeats"
+    "is not supported: use a firmware of the drive that has heartbeats"
 )
 
 MODE_REMEDY = (
-    "is another controller, a fault or a switch of the drive in the way? choose "
-    "the mode "
-    "with its own tool"
+    "is another controller, a fault or a switch of the drive in the way? choose the mode with its "
+    "own tool"
 )
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
@@ -166,8 +164,7 @@ def refusal(error: ObjectAccessError, axis: Axis) -> SetupRefused:
         f"found object {error.entry}{what} refused: {error.reason}",
         expected="an answer, as from the other objects that a recording needs",
         remedy="nothing has moved: is the drive being set up or updated by another tool, or in a "
-        "state that locks its "
-        "objects? switch it off and on, then try again",
+        "state that locks its objects? switch it off and on, then try again",
     )
 
 

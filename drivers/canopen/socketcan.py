@@ -440,8 +440,8 @@ def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -
         return ()
     return (
         f"the kernel gave {given >> 10} KiB of receive buffer instead of "
-        f"{receive_buffer_bytes >> 10} KiB: "
-        "raise net.core.rmem_max, or let the recorder have CAP_NET_ADMIN",
+        f"{receive_buffer_bytes >> 10} KiB: raise net.core.rmem_max, or let the recorder have "
+        "CAP_NET_ADMIN",
     )
 
 

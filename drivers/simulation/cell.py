@@ -423,7 +423,6 @@ def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
     if hub and error_frame_faults:
         raise SpecInvalid(
             f"the faults {', '.join(error_frame_faults)} are error frames, which the socketcand "
-            "protocol does not "
-            "have: leave them out (`silent` without an axis is bus-off without its error frame), "
-            "or take another bus"
+            "protocol does not have: leave them out (`silent` without an axis is bus-off without "
+            "its error frame), or take another bus"
         )

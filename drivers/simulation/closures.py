@@ -379,18 +379,16 @@ class Mechanism:
         if self.mobility < 1 or motors < self.mobility:
             raise SpecInvalid(
                 f"closures: {len(ids)} joints and {len(tree.closed)} closed directions of rank "
-                f"{_rank(jacobian)} leave "
-                f"{self.mobility} degrees of freedom; expected at least 1 and at most the {motors} "
-                "motors; correct "
-                "closures or motors"
+                f"{_rank(jacobian)} leave {self.mobility} degrees of freedom; expected at least 1 "
+                f"and at most the {motors} motors; correct closures or motors"
             )
         _, _, rows = np.linalg.svd(jacobian)
         directions = rows[-self.mobility :].T[:motors]
         if _rank(directions) < self.mobility:
             raise SpecInvalid(
                 f"motors: {', '.join(spec.motors)} move {_rank(directions)} of {self.mobility} "
-                "degrees of freedom at "
-                "the start; name the joints that have motors, or start away from the singular pose"
+                "degrees of freedom at the start; name the joints that have motors, or start away "
+                "from the singular pose"
             )
 
     def at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -427,8 +425,8 @@ class Mechanism:
         others = np.delete(rows[0], about, axis=0)
         if np.abs(others).max() > PLANAR or np.abs(rows[1] - rows[0]).max() > PLANAR:
             raise SpecInvalid(
-                f"closure {closure}: its links turn against each other about more "
-                "than one direction"
+                f"closure {closure}: its links turn against each other about more than one "
+                "direction"
             )
         return np.asarray(np.round(rows[0][about]))
 
@@ -461,8 +459,7 @@ class Mechanism:
         name = self._closures[worst].name
         raise SpecInvalid(
             f"closures: {name} stays open by {float(np.abs(error).max()):.3g} m or rad; expected "
-            "frames that can meet; "
-            "correct the assembly, the start, the frames or the directions"
+            "frames that can meet; correct the assembly, the start, the frames or the directions"
         )
 
     def _started(self, spec: CellSpec, assembled: FloatArray) -> FloatArray:
@@ -484,9 +481,8 @@ class Mechanism:
             worst = int(apart.argmax())
             raise SpecInvalid(
                 f"start of {spec.motors[worst]}: {spec.start_rad[worst]:.6g} rad or m, where the "
-                "closures allow "
-                f"{position[worst]:.6g} with the others; expected start positions that agree to "
-                f"{START_TOLERANCE:g}"
+                f"closures allow {position[worst]:.6g} with the others; expected start positions "
+                f"that agree to {START_TOLERANCE:g}"
             )
         return position
 

@@ -255,8 +255,8 @@ class Plant:
         if not fits or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
             raise SpecInvalid(
                 f"{n} axes, a URDF of {joints} joints, a drive train of shape {spec.ratio.shape} "
-                "and a start "
-                f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
+                f"and a start position of shape {spec.start_rad.shape}; all must have the same "
+                "number of axes"
             )
 
     def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
@@ -307,9 +307,8 @@ class Plant:
             if stiff * (1.0 / motor + 1.0 / links) > 2.0:
                 raise SpecInvalid(
                     f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of "
-                    f"{step_s * 1e6:g} us, a "
-                    f"motor inertia of {motor:g} kg m² and {links:.3g} kg m² behind it; lower "
-                    "stiffness or damping"
+                    f"{step_s * 1e6:g} us, a motor inertia of {motor:g} kg m² and {links:.3g} kg "
+                    "m² behind it; lower stiffness or damping"
                 )
 
     def set_brakes(self, closed: BoolArray) -> None:
@@ -391,11 +390,9 @@ class Plant:
         residual = self._advance()
         if not residual <= TOLERANCE_RAD_S:
             raise FrictionUnsolved(
-                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, "
-                "expected at most "
-                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values "
-                "that differ by many "
-                "orders of magnitude"
+                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at "
+                f"most {TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for "
+                "values that differ by many orders of magnitude"
             )
         if not self._resting.all():
             self._settle()
@@ -440,10 +437,8 @@ class Plant:
         if not (open_by <= OPEN and pivot >= SINGULAR):
             raise ClosureLost(
                 f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot "
-                f"{pivot:.3g} of the "
-                f"largest; expected at most {OPEN:g} and at least {SINGULAR:g}; the mechanism ran "
-                "into a singular "
-                "pose: keep the limits of motion away from it"
+                f"{pivot:.3g} of the largest; expected at most {OPEN:g} and at least {SINGULAR:g}; "
+                "the mechanism ran into a singular pose: keep the limits of motion away from it"
             )
 
     def _mass(self, model: pin.Model, data: pin.Data, position_rad: FloatArray) -> FloatArray:
@@ -481,9 +476,8 @@ def link_model(spec: CellSpec) -> pin.Model:
     if model.nq != model.nv or model.nv != model.njoints - 1:
         raise SpecInvalid(
             f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} "
-            "degrees of freedom; "
-            "expected revolute or prismatic joints alone (a continuous joint is written as "
-            "revolute with wide limits)"
+            "degrees of freedom; expected revolute or prismatic joints alone (a continuous joint "
+            "is written as revolute with wide limits)"
         )
     model.gravity.linear = np.asarray(spec.gravity_m_s2, dtype=np.float64)
     payload = spec.payload

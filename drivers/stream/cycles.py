@@ -66,9 +66,8 @@ class CycleBus:
     ) -> None:
         self.link = link
         self.clock = clock
-        self.faults: deque[DriverError] = (
-            deque()
-        )  #: What must stop a recording and was not raised yet, the oldest first
+        #: What must stop a recording and was not raised yet, the oldest first.
+        self.faults: deque[DriverError] = deque()
         self.emit = emit
         self.between = between
         self.cycles = 0  #: SYNCs sent, or followed

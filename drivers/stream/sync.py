@@ -427,7 +427,7 @@ class FollowedCycles(_CyclesByOrder):
         None without any.
 
         Only the order on the bus counts: frames that have arrived are read first, whatever the
-            clock shows.
+        clock shows.
         """
         bus = self.bus
         end_ns = self._deadline_ns

@@ -67,8 +67,7 @@ class Conditioning:
             numbers = ", ".join(sorted(expected.keys() - {"standstill_rad_s"}))
             raise ModelError(
                 f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
-                "and numbers "
-                f"{numbers}; give `conditioning`, or fit again"
+                f"and numbers {numbers}; give `conditioning`, or fit again"
             )
         order = round(found.pop("position_order"))
         speeds = tuple(found.pop("standstill_rad_s"))

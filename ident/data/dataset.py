@@ -326,8 +326,7 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
         between_s = (run.time_s[-1] - run.time_s[0]) / (samples - 1)
         raise refuse(
             f"time_s has {between_s:g} s between samples; expected seconds, and at most "
-            f"{1.0 / SLOWEST_HZ:g} s; "
-            "if these are milliseconds, divide them by 1000"
+            f"{1.0 / SLOWEST_HZ:g} s; if these are milliseconds, divide them by 1000"
         )
     lowest, highest = sorted((conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz))
     if not lowest > 0.0:

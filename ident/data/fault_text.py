@@ -75,8 +75,7 @@ def found(fault: ChannelFault) -> str:
             )
             return (
                 f"{what} that leaves its course by up to {_sized(fault)} and returns within "
-                f"{longest_ms:.3g} ms, "
-                f"{often}, {share}"
+                f"{longest_ms:.3g} ms, {often}, {share}"
             )
         case FaultKind.FROZEN:
             return f"{what} that keeps one number while its motor moves, {share}, {often}"
@@ -90,8 +89,7 @@ def found(fault: ChannelFault) -> str:
         case FaultKind.UNSIGNED:
             return (
                 f"{what} of which one part is {_sized(fault)} above the other, with nothing "
-                "between: negative numbers"
-                f"{_bits(fault)} that were read without their sign"
+                f"between: negative numbers{_bits(fault)} that were read without their sign"
             )
         case FaultKind.DISPLACED:
             return (
@@ -114,13 +112,11 @@ def remedy(fault: ChannelFault) -> str:
         case FaultKind.WRAPPING if is_position:
             return (
                 "record or export a counter of all turns (of 32 bits), or unwrap the column: "
-                "nothing in it says in "
-                "which turn it began"
+                "nothing in it says in which turn it began"
             )
         case FaultKind.WRAPPING | FaultKind.UNSIGNED:
             return (
-                "read the object or the column as a signed number of enough bits, and "
-                "record or "
+                "read the object or the column as a signed number of enough bits, and record or "
                 "import again"
             )
         case FaultKind.CLIPPED:

@@ -127,10 +127,9 @@ def limit_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterato
                 "current-limited",
                 (run.run,),
                 (axes[axis],),
-                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque "
-                "shows at most "
-                f"{run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the samples "
-                "were left out",
+                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque shows "
+                f"at most {run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the "
+                "samples were left out",
                 "a drive that gives the current that its reference asks for",
                 "raise the limit of the current in the drive, or record slower moves or with a "
                 "lighter payload",
@@ -143,12 +142,10 @@ def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
         (run.run,),
         (name,),
         f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % "
-        "of the samples; "
-        "they were left out",
+        "of the samples; they were left out",
         "a current that follows the torque at every moment",
         "record slower moves or with a lighter payload, or raise the limit of the current in the "
-        "drive or in what "
-        "recorded it",
+        "drive or in what recorded it",
     )
 
 
@@ -185,12 +182,11 @@ def _held_diagnosis(
         (run,),
         tuple(axes[axis] for axis in held),
         f"{what} that repeat the reading before while the robot moves, in up to {percent:.0f} % of "
-        "the samples, for "
-        f"some {typical_ms:.3g} ms; what lies between two new readings was filled in",
+        f"the samples, for some {typical_ms:.3g} ms; what lies between two new readings was filled "
+        "in",
         "a new reading in every sample",
         "record at the rate at which the controller answers, or let it answer at the rate of the "
-        "recording; noise of a "
-        "current between the readings is lost, and makes the error larger",
+        "recording; noise of a current between the readings is lost, and makes the error larger",
     )
 
 

@@ -368,10 +368,8 @@ def _all_alike(
         if beside is None:
             try:
                 beside = _ranked_beside(evidence, others, rng, gates)
-            except (
-                *UNFITTED,
-                TooFewMoves,
-            ):  # of the corrected description, other moves may be valid
+            # Of the corrected description, other moves may be valid.
+            except (*UNFITTED, TooFewMoves):
                 continue
         alike = _alike(beside, mistake)
         if alike:

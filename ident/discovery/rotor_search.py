@@ -107,9 +107,8 @@ def declared_forms(
     if given and not contains_rotor:
         raise EffectRefused(
             f"the declared {placed.name_among(axes)} is given a rotor; the load of that axis does "
-            "not contain its "
-            "rotor's inertia, which is a parameter of its own: leave rotor_inertia_kg_m2 and "
-            "with_rotor out"
+            "not contain its rotor's inertia, which is a parameter of its own: leave "
+            "rotor_inertia_kg_m2 and with_rotor out"
         )
     if given or not contains_rotor:
         return (placed,)

@@ -127,8 +127,7 @@ def change_significance(
     if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
         raise ValueError(
             f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± "
-            f"{new_std} "
-            f"and dispersion {dispersion}"
+            f"{new_std} and dispersion {dispersion}"
         )
     change = (new - old) * (np.sign(old) or 1.0)
     sigmas = _ratio(float(change), dispersion * math.hypot(old_std, new_std))

@@ -80,11 +80,12 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     ),
     # and what fits the residual best (ident.discovery.cables)
     tuple(position.Compensator(order) for order in (1, 2)),
+    # and what fits the residual best (ident.discovery.balancer)
     tuple(
         position.Counterbalance(ratio, phase_rad)
         for ratio in (0.2, 0.5)
         for phase_rad in np.linspace(-np.pi, np.pi, 6, endpoint=False).tolist()
-    ),  # and what fits the residual best (ident.discovery.balancer)
+    ),
 )
 """One family a row, with the values of its searched parameters that the search tries."""
 

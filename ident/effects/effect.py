@@ -387,14 +387,12 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
             if value not in range(1, axes + 1) or value == axis + 1:
                 raise EffectRefused(
                     f"effect {name!r} on axis {axis + 1} is given {setting} = {value:g}; it is the "
-                    "number of another "
-                    f"of the {axes} axes"
+                    f"number of another of the {axes} axes"
                 )
         elif not allowed.least <= settings[setting] <= allowed.largest:
             raise EffectRefused(
                 f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between "
-                f"{allowed.least:g} and "
-                f"{allowed.largest:g}"
+                f"{allowed.least:g} and {allowed.largest:g}"
             )
     if fault := effect.with_settings(settings).settings_fault:
         raise EffectRefused(f"effect {name!r} is given {fault}")
@@ -514,8 +512,7 @@ def fits_data(effect: Effect, runs: Sequence[Signals], axis: int) -> bool:
     except (Exception, SystemExit) as error:  # code of others
         raise EffectRefused(
             f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method "
-            "`fits_in`; expected True or "
-            "False; correct it"
+            "`fits_in`; expected True or False; correct it"
         ) from error
 
 
@@ -529,30 +526,25 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
     """
     try:
         found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # code of others: it may fail in any way, and even end the program
+    # Code of others: it may fail in any way, and even end the program.
+    except (Exception, SystemExit) as error:
         raise EffectRefused(
             f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method "
-            "`columns`; expected a "
-            "torque for every sample; correct it, and copy what it changes: the arrays of "
-            "`signals` are read-only"
+            "`columns`; expected a torque for every sample; correct it, and copy what it changes: "
+            "the arrays of `signals` are read-only"
         ) from error
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:
         raise EffectRefused(
             f"effect {effect.name!r}: found columns of shape {found.shape}; expected {expected}, "
-            "the last two for "
-            "coefficients and samples; correct its method `columns`"
+            "the last two for coefficients and samples; correct its method `columns`"
         )
     if not np.isfinite(found).all():
         raise EffectRefused(
             f"effect {effect.name!r}: found columns with numbers that are not finite; expected a "
-            "torque for every "
-            "sample; correct its method `columns`, or return False from `fits_in` where it "
-            "lacks a signal"
+            "torque for every sample; correct its method `columns`, or return False from `fits_in` "
+            "where it lacks a signal"
         )
     return found
 

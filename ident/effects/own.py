@@ -105,8 +105,7 @@ def installed_families() -> dict[str, InstalledFamily]:
             if name in found:
                 raise EffectRefused(
                     f"{where}: found effect {name!r}, which package {found[name].package!r} has, "
-                    "too; expected one "
-                    "package for each effect; remove one of the packages"
+                    "too; expected one package for each effect; remove one of the packages"
                 )
             found[name] = InstalledFamily(family, package)
     return found
@@ -175,10 +174,8 @@ def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
     """What an entry point names: one effect, or several."""
     try:
         loaded = point.load()
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # code of others: it may fail in any way, and even end the program
+    # Code of others: it may fail in any way, and even end the program.
+    except (Exception, SystemExit) as error:
         found = f"{point.value!r} that cannot be loaded ({type(error).__name__}: {error})"
         raise EffectRefused(
             f"{where}: found {found}; expected an effect; repair or remove the package"
@@ -192,8 +189,7 @@ def _check(effect: Effect, where: str) -> None:
     if not _NAME.fullmatch(name):  # names of parameters begin with it
         raise EffectRefused(
             f"{where}: found an effect with the name {name!r}; expected lowercase words joined by "
-            "hyphens, such as "
-            "'eccentric-friction'"
+            "hyphens, such as 'eccentric-friction'"
         )
     if name in SHIPPED and not is_shipped(effect):
         raise EffectRefused(
@@ -209,15 +205,14 @@ def _check(effect: Effect, where: str) -> None:
     if lost:
         raise EffectRefused(
             f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; "
-            "expected each as "
-            "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
+            "expected each as `Annotated[float, ident.Range(least, largest)]`: a calibration keeps "
+            "these alone"
         )
     if effect.side is GearSide.TWO_JOINTS and effect.axis_setting not in kept:
         raise EffectRefused(
             f"{where}: found effect {name!r} on two joints without a setting "
-            f"`{effect.axis_setting}`; expected the "
-            f"number of the second one: `{effect.axis_setting}: Annotated[int, ident.Range(0, "
-            "12)] = 0`"
+            f"`{effect.axis_setting}`; expected the number of the second one: "
+            f"`{effect.axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
         )
     _check_properties(effect, where)
     for setting, value in effect.settings.items():
@@ -225,28 +220,25 @@ def _check(effect: Effect, where: str) -> None:
         if type(value) is not kind:
             raise EffectRefused(
                 f"{where}: found {setting} = {value!r} in effect {name!r}; expected a value of "
-                f"type {kind.__name__}, "
-                f"as it is annotated; write {kind.__name__}({value!r})"
+                f"type {kind.__name__}, as it is annotated; write {kind.__name__}({value!r})"
             )
         allowed = setting_range(effect, setting)
         if not allowed.least <= value <= allowed.largest:
             raise EffectRefused(
                 f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from "
-                f"{allowed.least:g} to "
-                f"{allowed.largest:g}, as its range says; correct one of both"
+                f"{allowed.least:g} to {allowed.largest:g}, as its range says; correct one of both"
             )
     coefficients = [column.name for column in effect.coefficients]
     if len(set(coefficients)) < len(coefficients):
         raise EffectRefused(
-            f"{where}: found coefficients {coefficients} of effect {name!r}; "
-            "expected a name for each"
+            f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for "
+            "each"
         )
     unfit = [column.name for column in effect.coefficients if ":" in column.name or not column.name]
     if unfit or not effect.coefficients:
         raise EffectRefused(
             f"{where}: found coefficients {[column.name for column in effect.coefficients]} of "
-            f"effect {name!r}; "
-            "expected at least one, with a name without a colon"
+            f"effect {name!r}; expected at least one, with a name without a colon"
         )
 
 
@@ -267,12 +259,11 @@ def _check_properties(effect: Effect, where: str) -> None:
         if unknown:
             raise EffectRefused(
                 f"{where}: found {', '.join(unknown)} in `{given}` of effect {effect.name!r}; "
-                "expected names among its "
-                f"settings: {', '.join(settings) or 'it has none'}"
+                f"expected names among its settings: {', '.join(settings) or 'it has none'}"
             )
     if effect.reported is Reported.AMPLITUDE and len(effect.coefficients) != 2:
         raise EffectRefused(
             f"{where}: found {len(effect.coefficients)} coefficients of effect {effect.name!r}, "
-            "which reports give as "
-            "one amplitude; expected two, of a cosine and a sine; leave `reported` out"
+            "which reports give as one amplitude; expected two, of a cosine and a sine; leave "
+            "`reported` out"
         )

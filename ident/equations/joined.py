@@ -35,8 +35,7 @@ def join_systems(first: System, second: System, *, continues_move: bool = False)
     if first.unknowns != second.unknowns or first.payloads != second.payloads:
         raise ValueError(
             f"found unknowns {len(first.unknowns)} and {len(second.unknowns)}, payloads "
-            f"{first.payloads} and "
-            f"{second.payloads}; expected the same in both"
+            f"{first.payloads} and {second.payloads}; expected the same in both"
         )
     new_runs = tuple(name for name in second.runs if name not in first.runs)
     runs = first.runs + new_runs

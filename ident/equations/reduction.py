@@ -436,9 +436,8 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
             if known != payload:
                 raise DataUnfit(
                     run,
-                    f"mounting {payload.mounting!r} carries {payload} here and {known} in "
-                    "another run; "
-                    "give each way of mounting a name of its own",
+                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another "
+                    "run; give each way of mounting a name of its own",
                 )
             return index
     payloads.append(payload)

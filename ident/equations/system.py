@@ -244,16 +244,14 @@ def require_rows(system: System) -> None:
             raise DataUnfit(
                 ", ".join(system.runs),
                 f"{' and '.join(axes[joint].name for joint in joints)}, which motor {motor + 1} "
-                "turns with, "
-                "never move at the same time; record moves in which they do, or use another "
-                "estimator than ml",
+                "turns with, never move at the same time; record moves in which they do, or use "
+                "another estimator than ml",
             )
         if rows <= len(system.unknowns):
             raise DataUnfit(
                 ", ".join(system.runs),
                 f"motor {motor + 1} has {int(rows)} usable rows for {len(system.unknowns)} "
-                "unknowns; "
-                "record longer, or move it more",
+                "unknowns; record longer, or move it more",
             )
 
 
@@ -299,8 +297,7 @@ def require_distinct(system: System, *, gains: bool) -> None:
         if is_bare_seen and lost == (KNOWN_PAYLOAD,) and robot.carrier < robot.joint_count - 1:
             missing = (
                 "what is known of the payload does not show behind so few joints: say more of it, "
-                "as its centre of "
-                "mass (`centre_m`) beside its mass"
+                "as its centre of mass (`centre_m`) beside its mass"
             )
         raise RankDeficient(f"the data do not distinguish payload and robot: {missing}", lost)
     if gains:

@@ -261,8 +261,7 @@ def gain_diagnoses(
             f"{nameplate[axis]:.4g}",
             f"a gain that is more than {GAIN_SIGMAS:g} σ from zero",
             "these moves hardly show this gain: record faster and wider moves of this axis, loaded "
-            "too, and fit them "
-            "together with these; do not use this gain",
+            "too, and fit them together with these; do not use this gain",
         )
     for axis in np.flatnonzero(is_off).tolist():
         gain = f"{estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}"
@@ -386,9 +385,9 @@ def estimator_diagnoses(
             "estimators-disagree",
             (),
             (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, "
-            f"{percent:.0f} % from "
-            f"{likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same rows",
+            f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % "
+            f"from {likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same "
+            "rows",
             f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ",
             REMEDIES_OF_DISAGREEMENT[estimate.method],
         )
@@ -445,8 +444,7 @@ def axis_error_diagnoses(
                 found,
                 f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %",
                 "look for what contradicts the model on this axis: its current channel and sign, "
-                "gear ratio, payload, "
-                "friction or an effect that is not declared (`find_effects`)",
+                "gear ratio, payload, friction or an effect that is not declared (`find_effects`)",
             )
 
 
@@ -479,9 +477,8 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
             f"a condition number of {estimate.condition:.2g}",
             f"100 to 1e5, below {LARGEST_CONDITION:.0e}",
             "single parameters mean nothing here, and another motion is not predicted: move all "
-            "axes together, through "
-            "more of their range, and see whether the URDF rounds its angles (1.57 in "
-            "place of pi/2)",
+            "axes together, through more of their range, and see whether the URDF rounds its "
+            "angles (1.57 in place of pi/2)",
         )
 
 
@@ -537,8 +534,8 @@ def exchange_shown_by(evidence: ChannelEvidence, axes: Sequence[str]) -> Diagnos
         ),
         "each current to follow from the motion of its own axis",
         "exchange these currents: the drives' node numbers in the cell, and record again, because "
-        "a log keeps those "
-        "that it was recorded with; or the columns of the import, and import again",
+        "a log keeps those that it was recorded with; or the columns of the import, and import "
+        "again",
     )
 
 

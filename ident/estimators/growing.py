@@ -82,8 +82,7 @@ class GrowingFit:
             raise DataUnfit(
                 run.name,
                 f"found payload {run.payload}; expected one of those that this fit was begun with "
-                "(mountings: "
-                f"{mountings}); name all payloads when it begins",
+                f"(mountings: {mountings}); name all payloads when it begins",
             )
         for other in self.runs:
             if other.name == run.name:

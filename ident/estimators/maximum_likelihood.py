@@ -67,15 +67,13 @@ def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
         raise DataUnfit(
             ", ".join(system.runs),
             "the robot has more motors than degrees of freedom, and iv needs an equation for each "
-            "motor alone; "
-            "choose the method ml",
+            "motor alone; choose the method ml",
         )
     if not system.instruments:
         raise DataUnfit(
             ", ".join(system.runs),
             "the demanded motion is not known: the joints do not move from rest to rest at "
-            "trapezoidal speed; "
-            "choose the method ml, or record point-to-point moves",
+            "trapezoidal speed; choose the method ml, or record point-to-point moves",
         )
     return _maximum_likelihood(system.on_instruments(), system, Method.IV, fixed_gains)
 

@@ -82,8 +82,8 @@ def payload_diagnoses(
     runs = tuple(one.run for one in tied)
     evidence = (
         f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's "
-        "torque, its mass by "
-        f"{worst.difference[9]:+.2g} kg (by chance with p = {worst.probability:.0e})"
+        f"torque, its mass by {worst.difference[9]:+.2g} kg (by chance with p = "
+        f"{worst.probability:.0e})"
     )
     expected = "the same body, mounted in the same way, in all runs that say so"
     if len(runs) > 1:

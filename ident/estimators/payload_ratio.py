@@ -56,12 +56,10 @@ class MassContradiction:
             (),
             (),
             f"the masses of {names} contradict each other: by the torques {self.body} is "
-            f"{self.ratio:.2f} ± "
-            f"{self.std:.2f} times as heavy beside {beside} as declared",
+            f"{self.ratio:.2f} ± {self.std:.2f} times as heavy beside {beside} as declared",
             "masses that the torques confirm",
             f"weigh {names} again, and look what was mounted in each run; a wrong mass of any of "
-            "them makes every gain "
-            "wrong",
+            "them makes every gain wrong",
         )
 
 

@@ -172,15 +172,15 @@ def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str
         if turned_rad[widest] > WIDEST_RANGE_RAD:
             return (
                 f"found {axes[widest]} turning by {turned_rad[widest]:.4g} rad in run {run.run!r}; "
-                "expected a joint's "
-                "angle in rad: are these degrees, counts, or the motor's angle before the gear?"
+                "expected a joint's angle in rad: are these degrees, counts, or the motor's angle "
+                "before the gear?"
             )
         largest = int(np.argmax(run.limits))
         if run.limits[largest] > LARGEST_CURRENT_A:
             return (
                 f"found a current of {run.limits[largest]:.4g} A of {axes[largest]} in run "
-                f"{run.run!r}; expected "
-                "amperes: are these milliamperes, or thousandths of the rated current?"
+                f"{run.run!r}; expected amperes: are these milliamperes, or thousandths of the "
+                "rated current?"
             )
     return ""
 
@@ -241,8 +241,7 @@ def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
             found=numbers_text(gains),
             expected=f"the signs of the nameplate: {numbers_text(nameplate)}",
             remedy="were the payload's run and the run without load exchanged (look at "
-            "`Run.payload` of each run), "
-            "or do all currents count the other way?",
+            "`Run.payload` of each run), or do all currents count the other way?",
         )
 
 
@@ -280,15 +279,14 @@ def require_plausible(
         raise ModelContradicted(
             "the fit",
             found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on "
-            f"axis {axes[worst]}, "
-            f"with a gain of {estimate.gains[worst]:.3g} ± {estimate.gains_std[worst]:.2g}",
+            f"axis {axes[worst]}, with a gain of {estimate.gains[worst]:.3g} ± "
+            f"{estimate.gains_std[worst]:.2g}",
             expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis "
-            f"{LARGEST_AXIS_PERCENT:g} %, "
-            f"{LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller than its σ",
+            f"{LARGEST_AXIS_PERCENT:g} %, {LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller "
+            "than its σ",
             remedy="look for what contradicts the model: two channels exchanged or one reversed, a "
-            "wrong drive train, "
-            "gravity or URDF, positions not in rad, a payload or drawing that is not of the body "
-            "that was mounted",
+            "wrong drive train, gravity or URDF, positions not in rad, a payload or drawing that "
+            "is not of the body that was mounted",
         )
     parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     dry = [

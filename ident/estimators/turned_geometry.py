@@ -101,8 +101,7 @@ RUN_UNTIL_RIGHT = "what is predicted of this run means nothing until it is right
 """The same for a run that the fit has not seen: its gains are those of other recordings."""
 WHICH_IS_WRONG = (
     "these moves do not tell them apart: look how the base is mounted and where the zeros are, or "
-    "record moves through "
-    "more of the range of all joints; correct what is wrong, and fit again"
+    "record moves through more of the range of all joints; correct what is wrong, and fit again"
 )
 """Remedy where several explain the same."""
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
@@ -207,8 +206,7 @@ class TurnedGeometry:
             suggested_m_s2 = suggested_gravity(found.found_m_s2, np.full(3, std_m_s2))
             remedy = (
                 "how is the base mounted? correct `gravity_m_s2` of the cell: "
-                f"{_numbers(suggested_m_s2)} m/s² by "
-                f"these recordings; {until_right}"
+                f"{_numbers(suggested_m_s2)} m/s² by these recordings; {until_right}"
             )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
             return Diagnosis(
@@ -216,8 +214,8 @@ class TurnedGeometry:
                 runs,
                 (),
                 f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± "
-                f"{found.std_deg:.1f} deg from what "
-                f"the cell says, with {errors}, {declared}{others}",
+                f"{found.std_deg:.1f} deg from what the cell says, with {errors}, "
+                f"{declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
                 which_is_wrong if alike else remedy,
             )
@@ -227,8 +225,7 @@ class TurnedGeometry:
             turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
             remedy = (
                 f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the "
-                "zero in the "
-                f"controller, and fit again: {until_right}"
+                f"zero in the controller, and fit again: {until_right}"
             )
             return Diagnosis(
                 ZERO_TURNED,
@@ -240,17 +237,15 @@ class TurnedGeometry:
             )
         if reading.axis in self.reversed_currents:
             remedy = (
-                f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, "
-                "its row of "
-                "`drive_train.ratio` (`lead_mm` of a prismatic axis) and the sign of its "
+                f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, its "
+                "row of `drive_train.ratio` (`lead_mm` of a prismatic axis) and the sign of its "
                 "nameplate gain"
             )
         else:
             remedy = (
                 f"reverse the row of {name} in `drive_train.ratio` of the cell file (`lead_mm` of "
-                "a prismatic axis), "
-                "and leave its nameplate gain; of an import with `side: joint`, name it in "
-                "`reversed` of `position`"
+                "a prismatic axis), and leave its nameplate gain; of an import with `side: joint`, "
+                "name it in `reversed` of `position`"
             )
         return Diagnosis(
             POSITION_REVERSED,
@@ -808,7 +803,7 @@ class Judged:
         """Number of currents with another sign than the nameplate.
 
         That of a reversed axis counts half: where the axis of the URDF points the other way, both
-            are reversed.
+        are reversed.
         """
         against = self.fit.per_unit * gains < 0.0
         count = float(np.count_nonzero(against))

@@ -64,8 +64,8 @@ class Payload:
         if foreign:
             raise ModelError(
                 f"payload {self.name!r} has the known parameters {', '.join(map(repr, foreign))}; "
-                "expected names among "
-                f"{', '.join(LINK_PARAMETERS)}; write its mass as {{'m': 4.59}}"
+                f"expected names among {', '.join(LINK_PARAMETERS)}; write its mass as {{'m': "
+                "4.59}"
             )
         require_kind(
             "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
@@ -85,8 +85,8 @@ class Payload:
         # A negative mass would reverse the sign of every gain
         if mass_kg is not None and not mass_kg > 0.0:
             raise ModelError(
-                f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, "
-                "above 0 kg; weigh it"
+                f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; "
+                "weigh it"
             )
         _require_possible_inertia(self)
 
@@ -130,10 +130,9 @@ def _require_possible_inertia(payload: Payload) -> None:
     )
     raise ModelError(
         f"payload {payload.name!r} has an inertia that no body has: {inertia} [kg m², kg m, kg]; "
-        "expected one whose "
-        "principal moments are positive, none above the sum of the others, about the joint's "
-        "origin (Huygens-Steiner "
-        "with mx, my, mz included); check signs and frame, or give the mass alone"
+        "expected one whose principal moments are positive, none above the sum of the others, "
+        "about the joint's origin (Huygens-Steiner with mx, my, mz included); check signs and "
+        "frame, or give the mass alone"
     )
 
 

@@ -106,8 +106,8 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     if mobility is not None and found != mobility:
         raise ModelError(
             f"the closures leave {found} degrees of freedom at the assembly pose; expected "
-            f"{mobility} as declared: "
-            "is a closure missing, or does one hold a direction that must be free (`directions`)?"
+            f"{mobility} as declared: is a closure missing, or does one hold a direction that must "
+            "be free (`directions`)?"
         )
     motors = list(robot.axis_joints)
     driven = free[motors]
@@ -116,13 +116,13 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
         if len(motors) >= found and _generic_rank(robot, position, free, size_m) == found:
             raise ModelError(
                 f"the robot is singular at the assembly pose: there the motors {names} do not move "
-                f"all of its {found} "
-                "degrees of freedom, beside it they do; give an assembly pose inside the workspace"
+                f"all of its {found} degrees of freedom, beside it they do; give an assembly pose "
+                "inside the workspace"
             )
         raise ModelError(
             f"the motors {names} do not move all {found} degrees of freedom that the closures "
-            "leave; name a joint that "
-            "each motor drives, one for each degree of freedom at least (`motors`)"
+            "leave; name a joint that each motor drives, one for each degree of freedom at least "
+            "(`motors`)"
         )
     if len(motors) == found:
         independent = tuple(motors)
@@ -136,8 +136,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     if condition > LARGEST_CONDITION:
         raise ModelError(
             f"the assembly pose is close to a singularity: condition {condition:.3g} of the "
-            "closures; expected below "
-            f"{LARGEST_CONDITION:g}: give a pose inside the workspace"
+            f"closures; expected below {LARGEST_CONDITION:g}: give a pose inside the workspace"
         )
     return Assembly(position, independent, dependent, size_m, condition)
 
@@ -196,9 +195,8 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
         if values[worst] > LARGEST_CONDITION:
             raise ModelError(
                 f"the motion comes close to a singularity at {_at(robot, measured[worst])}: "
-                "condition "
-                f"{values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record "
-                "moves away from it"
+                f"condition {values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: "
+                "record moves away from it"
             )
     return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
 
@@ -237,19 +235,16 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     if apart[worst, axis] > LARGEST_MISFIT:
         raise ModelError(
             f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: "
-            f"{robot.axes[axis].name} is "
-            f"{apart[worst, axis] * units[axis]:.2g} away from where the others hold it; "
-            "expected at most "
-            f"{LARGEST_MISFIT * units[axis]:.2g} (rad or m): are signs, zeros and ratios of the "
-            "axes right?"
+            f"{robot.axes[axis].name} is {apart[worst, axis] * units[axis]:.2g} away from where "
+            f"the others hold it; expected at most {LARGEST_MISFIT * units[axis]:.2g} (rad or m): "
+            "are signs, zeros and ratios of the axes right?"
         )
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
         raise ModelError(
             f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} "
-            "of the robot's size "
-            "is left open; expected positions inside the workspace: are signs, zeros and units of "
-            "the axes right?"
+            "of the robot's size is left open; expected positions inside the workspace: are signs, "
+            "zeros and units of the axes right?"
         )
     return found.position_rad
 
@@ -436,9 +431,8 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     values = ", ".join(map(_gap, worst[0].directions, worst[1] * size_m, worst[1]))
     raise ModelError(
         f"closure {name!r} cannot close at the assembly pose: {values} apart where it is declared; "
-        "expected a pose of "
-        "all joints at which the frames of every closure nearly coincide (assembly_deg, "
-        "assembly_mm)"
+        "expected a pose of all joints at which the frames of every closure nearly coincide "
+        "(assembly_deg, assembly_mm)"
     )
 
 
@@ -507,8 +501,7 @@ def _check(robot: Robot, start: FloatArray) -> None:
         if joint.kind is JointKind.REVOLUTE and not abs(position) <= 2.0 * np.pi:
             raise ModelError(
                 f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected "
-                "-360° to 360° "
-                "(assembly_deg): whole turns change no pose"
+                "-360° to 360° (assembly_deg): whole turns change no pose"
             )
     for closure in robot.closures:
         if not closure.directions:

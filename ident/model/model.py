@@ -166,16 +166,14 @@ class Model:
         if motors != axes:
             raise ModelError(
                 f"the drive train has shape {self.drive_train.ratio.shape}, expected "
-                f"{(axes, axes)}: the robot has "
-                f"{axes} driven joints; give one motor for each"
+                f"{(axes, axes)}: the robot has {axes} driven joints; give one motor for each"
             )
         object.__setattr__(self, "assembly", assemble(self.robot))
         ratio = self.drive_train.ratio
         if self.is_redundant and np.count_nonzero(ratio - np.diag(np.diag(ratio))):
             raise ModelError(
                 "the robot has more motors than degrees of freedom, and motors that turn with the "
-                "joint of another; "
-                "expected a diagonal drive train there"
+                "joint of another; expected a diagonal drive train there"
             )
 
     @property
@@ -499,8 +497,8 @@ class Model:
         if shapes != [(*shapes[0][:1], count)] * 3:
             raise ModelError(
                 "position, velocity and acceleration have the shapes "
-                f"{', '.join(map(str, shapes))}; expected "
-                f"(n_samples, {count}) each: a row a sample, a column a joint"
+                f"{', '.join(map(str, shapes))}; expected (n_samples, {count}) each: a row a "
+                "sample, a column a joint"
             )
         return self._first(motion)
 

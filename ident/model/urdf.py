@@ -25,11 +25,9 @@ from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robo
 HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
 LINKAGE = (
     "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and "
-    "`motors`, as of a "
-    "closed chain (of a parallelogram, the link behind it keeps the direction of the link before "
-    "its leader: one "
-    "closure of the two links about the joints' axis); a gear or belt of another ratio between "
-    "joints is not supported"
+    "`motors`, as of a closed chain (of a parallelogram, the link behind it keeps the direction of "
+    "the link before its leader: one closure of the two links about the joints' axis); a gear or "
+    "belt of another ratio between joints is not supported"
 )
 """What to do about a joint that follows an axis."""
 XACRO_SPACES = (
@@ -262,14 +260,13 @@ def _require_free(
         if not np.isclose(position, elsewhere, rtol=0.0, atol=HELD_ALIKE):
             raise ModelError(
                 f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by "
-                "which it is at "
-                f"{elsewhere:g}; expected the same position [rad or m], or `hold` of one of the two"
+                f"which it is at {elsewhere:g}; expected the same position [rad or m], or `hold` "
+                "of one of the two"
             )
     elif mimic.leader in movable:
         raise ModelError(
             f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), "
-            "which moves: it follows "
-            f"and cannot be held; expected {LINKAGE}"
+            f"which moves: it follows and cannot be held; expected {LINKAGE}"
         )
 
 
@@ -460,8 +457,7 @@ def _joint(element: Element, at: Place) -> Joint:
     if not distance <= LARGEST_DISTANCE_M:
         raise ModelError(
             f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most "
-            f"{LARGEST_DISTANCE_M:g} m: "
-            "is the URDF in mm?"
+            f"{LARGEST_DISTANCE_M:g} m: is the URDF in mm?"
         )
     return Joint(
         name=name,

@@ -91,17 +91,16 @@ class LinkPrior:
     def __post_init__(self) -> None:
         if not LEAST_TOLERANCE <= self.tolerance <= LARGEST_TOLERANCE:
             raise ModelError(
-                f"the tolerance of the prior is {self.tolerance:g}; expected "
-                f"{LEAST_TOLERANCE:g} to "
-                f"{LARGEST_TOLERANCE:g}, one relative standard deviation of masses and "
-                "second moments"
+                f"the tolerance of the prior is {self.tolerance:g}; expected {LEAST_TOLERANCE:g} "
+                f"to {LARGEST_TOLERANCE:g}, one relative standard deviation of masses and second "
+                "moments"
             )
         for number, link in enumerate(self.links, start=1):
             if np.linalg.eigvalsh(pseudo_inertia(link))[0] <= 0.0:
                 raise ModelError(
                     f"link {number} of the prior is no possible body: its pseudo-inertia has a "
-                    "negative eigenvalue; "
-                    "expected a mass and an inertia for each moving link; correct the URDF"
+                    "negative eigenvalue; expected a mass and an inertia for each moving link; "
+                    "correct the URDF"
                 )
 
     @property
@@ -324,8 +323,7 @@ def _require_full(system: System, prior: LinkPrior) -> None:
     if robot.closures:
         raise ModelError(
             "the robot has a closed chain; expected a serial robot, each joint with a motor: for "
-            "the links of a loop "
-            "no masses are computed"
+            "the links of a loop no masses are computed"
         )
     if len(prior.links) != robot.joint_count:
         raise ModelError(

@@ -261,8 +261,7 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     if foreign:
         raise ModelError(
             f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; "
-            "use the cell of the "
-            "fit, with its drive train"
+            "use the cell of the fit, with its drive train"
         )
     order = np.argsort([index[name] for name in leading])
     independent = tuple(index[leading[i]] for i in order)
@@ -275,16 +274,14 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     if rank < len(independent):
         raise ModelError(
             f"the calibration has {len(independent)} base parameters, this robot only {rank}: "
-            "another geometry, "
-            "gravity or drive train"
+            "another geometry, gravity or drive train"
         )
     left = np.linalg.norm(unit - chosen @ weights, axis=0)
     unseen = [column.name for column, rest in zip(model.columns, left, strict=True) if rest > 1e-6]
     if unseen:
         raise ModelError(
             f"the calibration lacks {', '.join(unseen)}, which this robot's torque depends on: its "
-            "data did not "
-            "determine them, or it is of another robot"
+            "data did not determine them, or it is of another robot"
         )
     grouping = weights * scale / scale[list(independent), None]
     grouping[:, list(independent)] = np.eye(len(independent))
@@ -298,9 +295,8 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
             if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):
                 raise ModelError(
                     f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; "
-                    "this robot's "
-                    f"geometry gives {found:.6g}: it is not the robot, the gravity or the drive "
-                    "train of the fit"
+                    f"this robot's geometry gives {found:.6g}: it is not the robot, the gravity or "
+                    "the drive train of the fit"
                 )
     return BaseParameters(independent, grouping, ordered)
 

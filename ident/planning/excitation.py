@@ -183,7 +183,7 @@ class Design:
         + n, k).
 
         The currents that are expected are those without preload: with it, gains become better
-            known, not worse.
+        known, not worse.
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
@@ -294,7 +294,7 @@ class Design:
         inf for a column without rows.
 
         What a payload adds to friction is left out: in bare or in loaded runs alone it is no
-            unknown of its own.
+        unknown of its own.
         """
         payload_friction = self.expectation.model.loaded_friction_columns
         asked = np.flatnonzero(~np.isin(self.base.independent, payload_friction))
@@ -318,7 +318,7 @@ class Design:
         """How many of the n independent directions of ln g are known to UNSEEN_PERCENT.
 
         They are the eigenvectors of its covariance, of unit length: their errors are independent of
-            each other.
+        each other.
         """
         scaled, scale = self._scaled(information)
         last = self._factor_of_gains(scaled)

@@ -178,14 +178,11 @@ class Identifiability:
             worst = max((self.gains[axis] for axis in preloaded), key=lambda gain: gain.std_percent)
             out.append(
                 f"Internal preload obscures {_named(preloaded, axis_names)}: σ up to "
-                f"{worst.std_percent:.2g} %, "
-                f"{worst.known_preload_percent:.2g} % if it were known. These moves determine "
-                f"{self.rank} of "
-                f"{len(self.gains)} independent directions of the gains to {UNSEEN_PERCENT:g} %, "
-                "with known preload "
-                f"{known}. Shift and turn the platform farther: while its pose hardly changes, "
-                "preload passes for a "
-                "change of the gains."
+                f"{worst.std_percent:.2g} %, {worst.known_preload_percent:.2g} % if it were known. "
+                f"These moves determine {self.rank} of {len(self.gains)} independent directions of "
+                f"the gains to {UNSEEN_PERCENT:g} %, with known preload {known}. Shift and turn "
+                "the platform farther: while its pose hardly changes, preload passes for a change "
+                "of the gains."
             )
         if unmoved := self.hidden(Hidden.MOTION):
             out.append(

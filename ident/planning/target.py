@@ -76,8 +76,8 @@ def time_to_target(
         )
     if not np.all(std >= 0.0):
         raise ModelError(
-            f"std_percent is {std.tolist()}; expected σ of every gain, inf for one "
-            "that is not known"
+            f"std_percent is {std.tolist()}; expected σ of every gain, inf for one that is not "
+            "known"
         )
     ratio = np.zeros(std.shape)
     matters = np.isfinite(target)

@@ -146,8 +146,8 @@ def _comparison(repeats: int) -> dict[str, Any]:
         bare_qr = statistics.median(found["ours"][key])
         _print_line(
             f"LAPACK's QR (dgeqrf) of each joint's columns {which}, rows already built: "
-            f"{bare_qr:.3f} s; "
-            f"the whole of ours is {found['ours']['median_seconds'] / bare_qr:.2f} times that"
+            f"{bare_qr:.3f} s; the whole of ours is "
+            f"{found['ours']['median_seconds'] / bare_qr:.2f} times that"
         )
     return {
         "samples": SAMPLES,
@@ -200,8 +200,7 @@ def _growth(sizes: tuple[int, ...]) -> list[dict[str, Any]]:
         rows.append(row)
         _print_line(
             f"| {size} | {row['seconds']:.2f} | {row['microseconds_a_sample']:.2f} | "
-            f"{row['against_first']:.2f} "
-            f"| {row['peak_mb']:.0f} | {row['residual_std_nm']:.4f} |"
+            f"{row['against_first']:.2f} | {row['peak_mb']:.0f} | {row['residual_std_nm']:.4f} |"
         )
     return rows
 

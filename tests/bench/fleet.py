@@ -86,10 +86,9 @@ def main() -> int:
             same = sum(single[name] == _kept(out, name) for name in names)
             equal = min(equal, same)
             print_line(
-                f"--scheduler {kind} --workers {workers}: {figures['seconds']:.1f} s, "
-                "processor time "
-                f"{figures['processor_s']:.1f} s, largest process {figures['peak_mb']:.0f} MB, "
-                f"{same} of {len(names)} equal"
+                f"--scheduler {kind} --workers {workers}: {figures['seconds']:.1f} s, processor "
+                f"time {figures['processor_s']:.1f} s, largest process {figures['peak_mb']:.0f} "
+                f"MB, {same} of {len(names)} equal"
             )
     found = {
         "cells": len(names),
@@ -113,8 +112,8 @@ def summary_text(found: dict[str, Any]) -> str:
         seconds = ", ".join(f"{run['seconds']:.1f}" for run in runs)
         lines.append(
             f"  {name}: {seconds} s, processor time "
-            f"{statistics.median(run['processor_s'] for run in runs):.1f} s, "
-            f"largest process {max(run['peak_mb'] for run in runs):.0f} MB"
+            f"{statistics.median(run['processor_s'] for run in runs):.1f} s, largest process "
+            f"{max(run['peak_mb'] for run in runs):.0f} MB"
         )
     lines.append(
         f"  two workers against one: {found['ratio']:.2f}; equal results {found['equal']} "

@@ -53,8 +53,8 @@ def main() -> int:
         + "\n"
     )
     lines = [
-        f"| listener | processor time a frame | of candump's (asked: ≤ {ASKED_RATIO}) "
-        f"| highest rate × {NODES} axes without loss (asked: ≥ {ASKED_HZ} Hz) |",
+        f"| listener | processor time a frame | of candump's (asked: ≤ {ASKED_RATIO}) | highest "
+        f"rate × {NODES} axes without loss (asked: ≥ {ASKED_HZ} Hz) |",
         "|---|---|---|---|",
     ]
     for name, cost in costs.items():

@@ -51,9 +51,8 @@ def describe(number: int, outcome: Round, seconds: float) -> str:
     if outcome.unrestored:
         faults += f"; settings of {outcome.unrestored} not restored"
     return (
-        f"{number:4d}  {verdict}  exit {outcome.code}, {outcome.compared} values, "
-        f"{seconds:.0f} "
-        f"s: {faults}"
+        f"{number:4d}  {verdict}  exit {outcome.code}, {outcome.compared} values, {seconds:.0f} s: "
+        f"{faults}"
     )
 
 

@@ -77,13 +77,10 @@ class _Urdf:
         along = 0.03 + 0.01 * (self.count % 5)
         self.parts.append(
             f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent '
-            f'link="{parent}"/>'
-            f'<child link="{name}"/><axis xyz="{axis}"/><limit lower="-3" upper="3" velocity="3" '
-            'effort="99"/></joint>'
-            f'<link name="{name}"><inertial><origin xyz="{along} 0.01 -0.02"/><mass '
-            f'value="{mass}"/>'
-            '<inertia ixx="0.004" ixy="0.0003" ixz="-0.0002" iyy="0.006" iyz="0.0004" '
-            'izz="0.005"/></inertial></link>'
+            f'link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/><limit lower="-3" '
+            f'upper="3" velocity="3" effort="99"/></joint><link name="{name}"><inertial><origin '
+            f'xyz="{along} 0.01 -0.02"/><mass value="{mass}"/><inertia ixx="0.004" ixy="0.0003" '
+            'ixz="-0.0002" iyy="0.006" iyz="0.0004" izz="0.005"/></inertial></link>'
         )
         return name
 

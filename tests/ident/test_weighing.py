@@ -318,7 +318,7 @@ def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_l
         ]
 
     assert 2.0 * 0.02 > 5.0 * (5.0 / 7850.0) ** (2.0 / 3.0)
-    # My is near zero, and known to less than the cube's
+    # `my` is near zero, and known to less than the cube's
     assert identified(0.02) == ["Izz", "mx", "my", "m"]
     assert identified(0.2) == ["mx", "my", "m"]
 

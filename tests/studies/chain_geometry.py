@@ -128,8 +128,8 @@ def row(job: Job, found: dict[str, Any]) -> str:
     diagnoses = [f"{one['name']}: {one['found']}" for one in found["diagnoses"]]
     return (
         f"errors {np.round(errors, 2)} σ {np.round(std, 2)} largest z "
-        f"{np.max(np.abs(errors / std)):.1f}, {encoders}; "
-        f"effects {', '.join(effects) or 'none'}; diagnoses {'; '.join(diagnoses) or 'none'}"
+        f"{np.max(np.abs(errors / std)):.1f}, {encoders}; effects {', '.join(effects) or 'none'}; "
+        f"diagnoses {'; '.join(diagnoses) or 'none'}"
     )
 
 

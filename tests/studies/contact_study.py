@@ -190,8 +190,7 @@ def measured_rows(
 
 HEADER = (
     "| tail | correlation, s | scale later | quiet, min | alarms/h, mean | worst band | bands "
-    "above 1/h "
-    "| level, σ | lowest | highest | least possible |"
+    "above 1/h | level, σ | lowest | highest | least possible |"
 )
 
 

@@ -253,8 +253,7 @@ def main(arguments: Sequence[str]) -> int:
         alarms.update(lifted(truth, seed))
     _say(
         f"{given.cells} clean recordings, with free and with fixed gains, with nameplates up to 30 "
-        "% off, and with "
-        f"currents of one sign: {sum(alarms.values())} false alarms {dict(alarms)}"
+        f"% off, and with currents of one sign: {sum(alarms.values())} false alarms {dict(alarms)}"
     )
     rows.append(
         (
@@ -277,8 +276,8 @@ def main(arguments: Sequence[str]) -> int:
                 rows.append((mistake, gains, words, f"{times} of {given.mistaken}"))
     _say(
         f"limits: share {payload_diagnosis.LEAST_SHARE:g}, p "
-        f"{payload_diagnosis.LARGEST_PROBABILITY:g}, "
-        f"exchange {diagnosis.CHANNEL_FALL:g}, geometry {turned_geometry.LEAST_FALL:g}"
+        f"{payload_diagnosis.LARGEST_PROBABILITY:g}, exchange {diagnosis.CHANNEL_FALL:g}, geometry "
+        f"{turned_geometry.LEAST_FALL:g}"
     )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     with given.out.open("w", newline="", encoding="utf-8") as file:

@@ -254,9 +254,9 @@ def _work(task: _Task) -> tuple[str, ...]:
         finish(path, fingerprint)
         lines.append(
             f"{part} {row.case}, {row.world}: {', '.join(row.named) or 'nothing'}; "
-            f"{row.error_before_percent:.2f} -> "
-            f"{row.error_after_percent:.2f} %, worst gain {row.max_gain_error_percent:.2f} %, "
-            f"{row.processor_s:.0f} s, simulated in {row.simulation_s:.0f} s"
+            f"{row.error_before_percent:.2f} -> {row.error_after_percent:.2f} %, worst gain "
+            f"{row.max_gain_error_percent:.2f} %, {row.processor_s:.0f} s, simulated in "
+            f"{row.simulation_s:.0f} s"
         )
         simulation_s = 0.0
     return tuple(lines)
@@ -372,8 +372,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
             "ambiguity set",
             f"friction: {len(near)} of {len(friction)} within 0.3 points of their clean floor",
             "processor time with one effect: median "
-            f"{np.median([row.processor_s for row in single]):.0f} s, "
-            f"most {max(row.processor_s for row in single):.0f} s",
+            f"{np.median([row.processor_s for row in single]):.0f} s, most "
+            f"{max(row.processor_s for row in single):.0f} s",
             f"gains: {len(small)} of {len(single)} within {GAIN_PERCENT} %",
         ]
     clean = [row for row in rows if row.part == "clean"]
@@ -382,9 +382,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         gain = max(row.max_gain_error_percent for row in clean)
         lines.append(
             f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect, "
-            f"{sum(bool(row.set_aside) and not row.named for row in clean)} with one that was "
-            "set aside; "
-            f"error {error:.2f} % in the mean, worst gain {gain:.2f} %"
+            f"{sum(bool(row.set_aside) and not row.named for row in clean)} with one that was set "
+            f"aside; error {error:.2f} % in the mean, worst gain {gain:.2f} %"
         )
     for name, group in (("clean", clean), ("with one effect", single)):
         for method in ("", "iv_"):
@@ -402,8 +401,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
                 held = 100.0 * np.mean(np.abs(errors) < WITHIN_95 * stds)
                 lines.append(
                     f"gains of cells {name} by {method.strip('_') or 'ml'}: error "
-                    f"{np.abs(errors).mean():.2f} % in the "
-                    f"mean, {np.abs(errors).max():.2f} % at most; 95 % intervals hold {held:.1f} %"
+                    f"{np.abs(errors).mean():.2f} % in the mean, {np.abs(errors).max():.2f} % at "
+                    f"most; 95 % intervals hold {held:.1f} %"
                 )
     if rows:
         bent = [
@@ -427,8 +426,7 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         small = [row for row in further if row.max_gain_error_percent <= GAIN_PERCENT]
         lines.append(
             f"cables, drifts and play: {len(first)} of {len(further)} named first, gains of "
-            f"{len(small)} within "
-            f"{GAIN_PERCENT} %"
+            f"{len(small)} within {GAIN_PERCENT} %"
         )
     imported = [row for row in rows if row.part == "imported"]
     if imported:

@@ -155,9 +155,8 @@ def main(arguments: list[str] | None = None) -> int:
             if len(ratios):
                 print_line(
                     f"{world}, {source.value}: {np.sum(ratios > 1.0)} of {len(ratios)} lower "
-                    "limits above the error of "
-                    f"the fit; they are {ratios.min():.2f} to {ratios.max():.2f} of it, median "
-                    f"{np.median(ratios):.2f}"
+                    f"limits above the error of the fit; they are {ratios.min():.2f} to "
+                    f"{ratios.max():.2f} of it, median {np.median(ratios):.2f}"
                 )
     return 0
 

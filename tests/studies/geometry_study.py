@@ -92,8 +92,7 @@ def summary(rows: Sequence[MistakeRow]) -> str:
     """A line for each robot, mistake and size."""
     lines = [
         "| robot | mistake | size | planted | refused | named | within 3 σ | sense +/− | with "
-        "others | "
-        "error % | worst gain % |",
+        "others | error % | worst gain % |",
         "|" + "---|" * 11,
     ]
     kinds = dict.fromkeys((row.robot, row.mistake, row.size) for row in rows)

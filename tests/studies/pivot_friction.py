@@ -197,10 +197,8 @@ def verdict(rows: Sequence[dict[str, Any]]) -> str:
     silent = [row for row in clean if not row["named"]]
     return (
         f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; "
-        "friction of the tree "
-        f"named on a pivot in {len(on_pivots)} of {len(shipped)} shipped plants; {len(silent)} of "
-        f"{len(clean)} clean "
-        "plants silent"
+        f"friction of the tree named on a pivot in {len(on_pivots)} of {len(shipped)} shipped "
+        f"plants; {len(silent)} of {len(clean)} clean plants silent"
     )
 
 

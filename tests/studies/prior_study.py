@@ -423,9 +423,8 @@ def agreement(base_rows: Sequence[Sequence[str]]) -> str:
     moved = [abs(float(row[5]) - float(row[3])) / float(row[4]) for row in base_rows]
     said = [f"{name} {np.sum(np.array(one) < 2.0)} of {len(one)}" for name, one in sigmas.items()]
     return (
-        f"base parameters within 2 σ of the published ones: {', '.join(said)}; the prior "
-        "moves them by "
-        f"{max(moved):.1f} σ of the fit at most"
+        f"base parameters within 2 σ of the published ones: {', '.join(said)}; the prior moves "
+        f"them by {max(moved):.1f} σ of the fit at most"
     )
 
 

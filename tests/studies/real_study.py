@@ -67,8 +67,7 @@ def summary(rows: Sequence[JudgedEffect]) -> str:
     lines = [
         "| recording | split | parts | effects written | raise an axis beyond noise | these by "
         f"{SEEN_POINTS:g} points | raise an axis by {CLEAR_POINTS:g} point at all | totals that "
-        "rise | beyond noise | "
-        "mean error % | total error % |",
+        "rise | beyond noise | mean error % | total error % |",
         "|" + "---|" * 11,
     ]
     for name in RECORDINGS:

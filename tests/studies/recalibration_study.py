@@ -98,8 +98,7 @@ def week_text(rig: Rig, factor: float) -> str:
     else:
         drift = f"{gain.drift_sigma:+.1f}"
     return (
-        f"{drift:>6} σ   found {gain.new:.3f} ± {gain.new_std:.3f}   was "
-        f"{gain.old:.3f}   truth "
+        f"{drift:>6} σ   found {gain.new:.3f} ± {gain.new_std:.3f}   was {gain.old:.3f}   truth "
         f"{true:.3f}"
     )
 
@@ -187,8 +186,8 @@ def moments(folder: Path, count: int, seed: int = 1) -> int:
         written = written + (was_killed and was_written)
     print_line(
         f"{killed} jobs killed within {2.0 * whole_s:.1f} s, {written} of them after their write; "
-        "every next job ended "
-        "with 0, every file was the old or the new one, every --verify was right"
+        "every next job ended with 0, every file was the old or the new one, every --verify was "
+        "right"
     )
     return int(killed < count)
 

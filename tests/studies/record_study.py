@@ -196,8 +196,8 @@ def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
     missing = [str(path) for path in (*fit, *validation, *second) if not path.is_file()]
     if missing:
         raise FileNotFoundError(
-            f"found no {', '.join(missing)}; record with "
-            f"`python -m tests.studies.record_study --seeds {seed} --floors {floor}`"
+            f"found no {', '.join(missing)}; record with `python -m tests.studies.record_study "
+            f"--seeds {seed} --floors {floor}`"
         )
     truth = truth_from(json.loads((folder / "truth.json").read_text()))
     if truth.noise_factor != FLOORS[floor]:

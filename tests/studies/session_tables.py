@@ -138,8 +138,7 @@ def summary(units: Sequence[dict[str, Any]]) -> str:
     """A line for each robot, and the reasons of what failed."""
     lines = [
         "| robot | seeds | guided: motion s | changes | step by step: duration s | ratio of times, "
-        "median | worst | "
-        "target missed | error / σ, rms | worst error % |",
+        "median | worst | target missed | error / σ, rms | worst error % |",
         "|" + "---|" * 10,
     ]
     for row in robot_rows(units):

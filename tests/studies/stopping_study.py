@@ -152,8 +152,7 @@ def table(looks_of_arm: dict[str, list[list[Look]]]) -> str:
     """A line for each arm, target and rule."""
     lines = [
         "| arm | target σ % | stopped by | cells | recorded, s (5, 50, 95 %) | mean error % | "
-        "error / σ, rms | "
-        "95 % intervals that hold the truth, % |",
+        "error / σ, rms | 95 % intervals that hold the truth, % |",
         "|" + "---|" * 8,
     ]
     for arm, cells in looks_of_arm.items():

@@ -212,9 +212,8 @@ def fingerprint_of(unit: WarmingCell) -> str:
 def summary(rows: Sequence[Row]) -> str:
     """A line for each time constant, order and friction: the means over the cells."""
     lines = [
-        "| time constant, min | order | friction | cells | bent by % | after the search: "
-        "bent by % | "
-        "largest error % | σ where friction stays % |",
+        "| time constant, min | order | friction | cells | bent by % | after the search: bent by % "
+        "| largest error % | σ where friction stays % |",
         "|" + "---|" * 8,
     ]
     constants_min = sorted({row.time_constant_min for row in rows})

@@ -44,7 +44,7 @@ RPDO = 0x200
 SDO_REQUEST = 0x600
 SDO_ANSWER = 0x580
 NEW_SETPOINT = 0x10
-# Linux/can.h, linux/can/error.h
+# linux/can.h, linux/can/error.h
 CAN_ERR_FLAG, CAN_ERR_CRTL, CAN_ERR_BUSOFF = 0x2000_0000, 0x004, 0x040
 PASSIVE = 0x30  # CAN_ERR_CRTL_RX_PASSIVE | CAN_ERR_CRTL_TX_PASSIVE, in the second byte
 IFF_UP, SIOCGIFFLAGS, SIOCSIFFLAGS = 0x1, 0x8913, 0x8914  # linux/if.h, linux/sockios.h

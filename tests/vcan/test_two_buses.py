@@ -41,7 +41,7 @@ class SyncTimes:
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
 
     def __enter__(self) -> Self:
-        # Struct can_filter: base data frames of that identifier
+        # struct can_filter: base data frames of that identifier
         wanted = struct.pack("=II", 0x080, 0xC000_07FF)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, wanted)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 8 << 20)
@@ -106,9 +106,8 @@ def test_a_run_is_complete_and_its_syncs_are_near_together(
     assert apart_us[0] > 0
     figure(
         f"two buses: {done['samples']} samples, {done['lost_cycles']} cycles lost, attempt "
-        f"{attempt}; "
-        f"SYNCs {middle:.0f} µs apart (median; {apart_us[len(apart_us) * 99 // 100]:.0f} "
-        "µs at 99 %)"
+        f"{attempt}; SYNCs {middle:.0f} µs apart (median; "
+        f"{apart_us[len(apart_us) * 99 // 100]:.0f} µs at 99 %)"
     )
 
 

@@ -74,8 +74,7 @@ def configuration(context: GateContext) -> Iterator[GateFinding]:
             f"recorded with cell configuration {found[:12] or 'unknown'}…",
             f"{expected[:12]}…, the cell's configuration now",
             "fit the same logs with this cell file (--cell), record again, or see what changed "
-            "since and accept it "
-            "with --configuration-changed",
+            "since and accept it with --configuration-changed",
         )
 
 
@@ -238,8 +237,7 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
                 f"{left:.2f} % of this axis's torque in the held-out run",
                 f"less than the {before:.2f} % that the nameplate leaves",
                 "the nameplate is better than this gain: did the drive, or the scale of its "
-                "current, change between "
-                "the runs?",
+                "current, change between the runs?",
             )
 
 

@@ -57,8 +57,8 @@ GATES: tuple[GateRow, ...] = (
         Gate.ERROR,
         (fit.error,),
         "check drive train, roles, payload, units",
-        f"`max_error_percent: {_LIMITS.max_error_percent:g}`, "
-        f"`max_axis_error_percent: {_LIMITS.max_axis_error_percent:g}`",
+        f"`max_error_percent: {_LIMITS.max_error_percent:g}`, `max_axis_error_percent: "
+        f"{_LIMITS.max_axis_error_percent:g}`",
     ),
     GateRow(
         Gate.HOLDOUT,

@@ -18,9 +18,8 @@ from ident.plausible import format_at_limit
 
 _SPELLING = 1e-9  #: Two spellings of one number are one number
 _CURRENT_SCALE = (
-    "check scale and amplitude (RMS or peak) of the current in the drive "
-    "profile, and "
-    "the payload's mass"
+    "check scale and amplitude (RMS or peak) of the current in the drive profile, and the "
+    "payload's mass"
 )
 
 

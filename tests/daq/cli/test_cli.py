@@ -250,8 +250,8 @@ def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> Non
 def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) -> None:
     heavy = ("matplotlib", "pinocchio", "numba", "scipy", "canopen")
     code = (
-        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});"
-        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});print([name for name in "
+        f"{heavy!r} if name in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=checkout, check=True

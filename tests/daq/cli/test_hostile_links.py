@@ -140,7 +140,7 @@ def _outputs() -> Iterator[tuple[str, list[str]]]:
     """Yield a name and the words of a command line for each place that a verb writes to,
     PIPE for that place.
     """
-    # Which shows the report of a folder
+    # `console` only shows a folder's report.
     for verb in (verb for verb in VERBS if verb.name != "console"):
         for kind in verb.kinds or (verb,):
             if verb.kinds:

@@ -62,9 +62,8 @@ def data_sheet(text: bytes, name: str, node_id: int | None = None) -> ObjectDict
     try:
         sheet: ObjectDictionary = import_eds(StringIO(readable), node_id)
         _complete_compact_arrays(sheet, readable)
-    except (
-        Exception
-    ) as error:  # canopen raises errors of many kinds for a file that is not a data sheet
+    # canopen raises errors of many kinds for a file that is not a data sheet.
+    except Exception as error:
         raise ValueError(
             _message(name, f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}")
         ) from error

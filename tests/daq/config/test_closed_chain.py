@@ -47,28 +47,24 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
             ASSEMBLY,
             "crank-1: 90, elbow-1: 90, crank-2: 0, elbow-2: 0",
             "11: closures: found closure 'tip' cannot close at the assembly pose: x 643 mm, y 243 "
-            "mm apart where it is "
-            "declared; expected a pose of all joints at which the frames of every closure nearly "
-            "coincide "
-            "(assembly_deg, assembly_mm)",
+            "mm apart where it is declared; expected a pose of all joints at which the frames of "
+            "every closure nearly coincide (assembly_deg, assembly_mm)",
             id="cannot close",
         ),
         pytest.param(
             "mobility: 2",
             "mobility: 3",
             "11: closures: found the closures leave 2 degrees of freedom at the assembly pose; "
-            "expected 3 as declared: "
-            "is a closure missing, or does one hold a direction that must be free (`directions`)?",
+            "expected 3 as declared: is a closure missing, or does one hold a direction that must "
+            "be free (`directions`)?",
             id="mobility",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1]",
             "11: closures: found the motors crank-1 do not move all 2 degrees of freedom that the "
-            "closures leave; name "
-            "a joint that each motor drives, one for each degree of freedom at least (`motors`); "
-            "expected a mechanism "
-            "that closes, and that its motors move",
+            "closures leave; name a joint that each motor drives, one for each degree of freedom "
+            "at least (`motors`); expected a mechanism that closes, and that its motors move",
             id="too few motors",
         ),
         pytest.param(
@@ -89,8 +85,7 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
             "second: rod-2-tip",
             "second: rod-2-tap",
             "12: closures[0].second: found 'rod-2-tap'; expected a link of the URDF: base, "
-            "crank-link-1, rod-1, plate, "
-            "rod-1-tip, crank-link-2, rod-2, rod-2-tip",
+            "crank-link-1, rod-1, plate, rod-1-tip, crank-link-2, rod-2, rod-2-tip",
             id="unknown link",
         ),
         pytest.param(
@@ -123,8 +118,7 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
             "- name: crank-2\n",
             "- name: elbow-1\n",
             "6: robot.motors[1]: found crank-2 as the joint of axis elbow-1, and joint elbow-1 "
-            "without a motor; "
-            "expected elbow-1, or another name of that axis (`axes[1].name`)",
+            "without a motor; expected elbow-1, or another name of that axis (`axes[1].name`)",
             id="axis named as a joint without a motor",
         ),
         pytest.param(
@@ -138,24 +132,22 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
             MOTORS,
             "motors: [crank-1, elbow-2]",
             "6: robot.motors[1]: found elbow-2 as the joint of axis crank-2, and joint crank-2 "
-            "without a motor; "
-            "expected crank-2, or another name of that axis (`axes[1].name`)",
+            "without a motor; expected crank-2, or another name of that axis (`axes[1].name`)",
             id="a joint without a motor among the motors",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1, crank-2, elbow-1]",
             "6: robot.motors: found 3 joints for 2 axes; expected the joint of each axis, in their "
-            "order (crank-1, "
-            "crank-2)",
+            "order (crank-1, crank-2)",
             id="more motors than axes",
         ),
         pytest.param(
             "mass_tolerance_kg: 0.005\n",
             "mass_tolerance_kg: 0.005\n    known: {mx: 0.1}\n",
             "45: payloads[0].known: found single parameters, and the link plate is not at the "
-            "origin of its joint; "
-            "expected `centre_m` and `inertia_kg_m2`, in the frame of that link",
+            "origin of its joint; expected `centre_m` and `inertia_kg_m2`, in the frame of that "
+            "link",
             id="single parameters in the frame of a platform",
         ),
     ],
@@ -174,8 +166,8 @@ def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -
         _cell(tmp_path, ("- [0, 0, -5, 0]", "- [0, 1, -5, 0]"), name="dualv")
     assert str(refusal.value) == (
         f"{tmp_path}/cell.yaml:20: drive_train.ratio[2]: found the motor of crank-3 also turns "
-        "with crank-2; expected "
-        "zeros off the diagonal: 4 motors for 3 degrees of freedom; correct the cell file"
+        "with crank-2; expected zeros off the diagonal: 4 motors for 3 degrees of freedom; correct "
+        "the cell file"
     )
     # Two motors, two degrees of freedom
     assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0

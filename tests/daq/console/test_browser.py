@@ -285,8 +285,7 @@ def test_a_page_of_another_site_reads_nothing_and_stops_nothing(
         other.goto("http://evil.example/")
         for method in ("GET", "POST"):
             asked = (
-                f"fetch('{made.address}stop', {{method: '{method}'}}).then(() => "
-                "'read', () => "
+                f"fetch('{made.address}stop', {{method: '{method}'}}).then(() => 'read', () => "
                 "'refused')"
             )
             assert other.evaluate(asked) == "refused"

@@ -455,8 +455,7 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
     } == {
         "folder.mcap": f"{logs}/folder.mcap: found a folder",
         "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to "
-        f"{tmp_path}/unmounted.mcap, "
-        "which leads nowhere",
+        f"{tmp_path}/unmounted.mcap, which leads nowhere",
         "link.mcap": f"{logs}/link.mcap: found a folder",
         "pipe.mcap": f"{logs}/pipe.mcap: found something that is no regular file",
         "round.mcap": f"{logs}/round.mcap: found a link to {logs}/round.mcap, which leads nowhere",

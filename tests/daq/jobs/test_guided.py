@@ -1056,8 +1056,7 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
     folder = rig.session.folder
     command = (
         f"`drivegain residual {folder}/block-1-bare.mcap {folder}/block-2-loaded.mcap --cell "
-        f"{rig.cell_file} "
-        f"--out {folder}/corrected.yaml`"
+        f"{rig.cell_file} --out {folder}/corrected.yaml`"
     )
     assert (f"The recorded blocks are not lost: {command} fits them with the new content") in str(
         caught.value

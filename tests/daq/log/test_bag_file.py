@@ -167,8 +167,8 @@ def test_a_bag_without_the_joints_says_what_it_has(
     shutil.copyfile(database, path)
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(
-            "DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE "
-            "name = '/joint_states')"
+            "DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = "
+            "'/joint_states')"
         )
     with pytest.raises(
         TableUnfit,

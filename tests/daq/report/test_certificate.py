@@ -371,8 +371,7 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     texts = Reader(page.read_text(encoding="utf-8")).texts
     assert (
         "More than noise: the probability that noise alone makes such a change, on any axis, is "
-        "below 1 %; the current "
-        "gain is taken as exact on all axes."
+        "below 1 %; the current gain is taken as exact on all axes."
     ) in texts
     # Of gains that must not be written the page does not show what would be.
     assert not {axis["written"] for axis in document["axes"]} & set(texts)

@@ -767,8 +767,8 @@ def test_what_the_fit_has_checked_is_taken_up_where_the_effects_explain_it(close
     )
     assert said.startswith(
         "Without the effects, the fit said CHECK J3: an error of 2.1 in 8 Nm (or N), 26.6 % "
-        "(axis-error). With them it "
-        "does not: the error of the current of J3 on held-out runs falls from"
+        "(axis-error). With them it does not: the error of the current of J3 on held-out runs "
+        "falls from"
     )
 
 
@@ -802,8 +802,7 @@ def test_a_correction_that_the_error_hardly_shows_has_its_own_sigma_and_the_axis
     )
     assert sentence == (
         "J2 has a zero that is off: it hardly shows in the error of all axes on held-out runs, "
-        "3.12 % without it and "
-        "3.09 % with it; most in that of J1, 3.20 and 3.00 %."
+        "3.12 % without it and 3.09 % with it; most in that of J1, 3.20 and 3.00 %."
     )
     spring = closed.fitted.steps[0].after
     (size,) = coefficients(spring, SPRING)
@@ -861,8 +860,7 @@ def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed)
     sentences = [one for one in summary(asked, closed.account, ()) if "failed a check" in one]
     assert sentences == [
         "J2: friction that grows with the load would explain 40 % of the squared residual, but "
-        "failed a check: "
-        "coefficient is -1 ± 0.1. The cause may be another one."
+        "failed a check: coefficient is -1 ± 0.1. The cause may be another one."
     ]
 
 
@@ -883,8 +881,7 @@ def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it
     sentences = [one for one in summary(asked, closed.account, ()) if "impossible" in one]
     assert sentences == [
         "J2: friction that grows with the load ranks first on this axis, but its sign or size is "
-        "impossible: "
-        f"{why}. The cause may be another one."
+        f"impossible: {why}. The cause may be another one."
     ]
     much = replace(asked, steps=(first, replace(last, findings=(replace(refused, explained=0.4),))))
     assert len([one for one in summary(much, closed.account, ()) if why in one]) == 1
@@ -934,9 +931,8 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     )
     sentences = [one for one in summary(asked, closed.account, ()) if "rests on" in one]
     assert sentences == [
-        f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on "
-        "two moves, "
-        f"too few to test it: record more {RECORD[Abscissa.CURRENT]}."
+        f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on two "
+        f"moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}."
     ]
 
 
@@ -955,8 +951,7 @@ def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(close
     )
     assert (
         "J2: what looks like friction that grows with the load depends clearly more on the joint "
-        "position, and was not "
-        "added: it would move the gain of J4 by 2.9 σ."
+        "position, and was not added: it would move the gain of J4 by 2.9 σ."
     ) in sentences
 
 

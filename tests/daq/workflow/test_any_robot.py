@@ -121,13 +121,12 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
         ("nameplate_gain_nm_per_a: 12.0", "nameplate_gain_n_per_a: 12.0", "a gain in N, .* joint "
                                                                           "A, which is revolute"),
         ("standstill_mm_s: [8, 8, 5, null, null]", "#", "0 speeds; expected 5"),
-        ("standstill_mm_s: [8, 8, 5, "
-         "null, null]", "standstill_mm_s: [8, 8, 5, null]", "4 speeds; expected 5"),
-        ("[8, 8, 5, "
-         "null, null]", "[8, 8, null, "
-                        "null, null]", "None for Z, which is prismatic; expected a speed"),
-        ("[null, null, null, "
-         "0.03, 0.03]", "[0.1, null, null, 0.03, 0.03]", "0.1 for X, .* expected null"),
+        ("standstill_mm_s: [8, 8, 5, null, "
+         "null]", "standstill_mm_s: [8, 8, 5, null]", "4 speeds; expected 5"),
+        ("[8, 8, 5, null, null]", "[8, 8, null, null, "
+                        "null]", "None for Z, which is prismatic; expected a speed"),
+        ("[null, null, null, 0.03, "
+         "0.03]", "[0.1, null, null, 0.03, 0.03]", "0.1 for X, .* expected null"),
     ],
 )  # fmt: skip
 def test_mm_and_degrees_are_not_confused(

@@ -97,13 +97,12 @@ def export(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, 
 SHAPES = {
     "link1": '<visual><geometry><box size="0.2 0.4 0.6"/></geometry><material '
     'name="grey"/></visual>',
-    "link2": '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/>'
-    '<geometry><mesh filename="package://arm_description/meshes/link 2.stl" scale="2 2 '
-    '-2"/></geometry></visual>',
+    "link2": '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/><geometry><mesh '
+    'filename="package://arm_description/meshes/link 2.stl" scale="2 2 -2"/></geometry></visual>',
     "link3": '<visual><geometry><mesh filename="../meshes/flat.STL"/></geometry></visual>'
     '<collision><geometry><cylinder radius="0.05" length="0.4"/></geometry></collision>',
-    "link5": '<visual><geometry><sphere radius="0.07"/></geometry>'
-    '<material name="own"><color rgba="1 0 0 0.5"/></material></visual>',
+    "link5": '<visual><geometry><sphere radius="0.07"/></geometry><material name="own"><color '
+    'rgba="1 0 0 0.5"/></material></visual>',
 }
 
 

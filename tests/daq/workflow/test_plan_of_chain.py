@@ -140,8 +140,7 @@ def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
     (line,) = (line for line in text.splitlines() if line.startswith("Assembly pose"))
     assert line == (
         "Assembly pose, to compare with the robot: elbow-1 0 deg, elbow-2 0 deg while the motors' "
-        "joints are at "
-        "crank-1 0 deg, crank-2 0 deg."
+        "joints are at crank-1 0 deg, crank-2 0 deg."
     )
 
 

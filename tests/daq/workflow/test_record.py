@@ -387,6 +387,5 @@ def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) 
     assert done.log.valid
     assert [text for text in done.warnings if "another master" in text] == [
         "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but "
-        "end that program "
-        "before the next run"
+        "end that program before the next run"
     ]

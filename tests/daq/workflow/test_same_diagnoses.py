@@ -222,8 +222,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "sizes": (of_size(0, 1, 2), "CurrentUnsigned"),
     "size of J3": (of_size(2), "CurrentUnsigned"),
     "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
-    "position of "
-    "J2 reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
+    "position of J2 "
+    "reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
     "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
     "zero of J2 off": (lambda runs: [offset(run) for run in runs], "zero-off J2"),
     "all currents late": (late_currents(0.004, 0.004, 0.004), "time-skew"),

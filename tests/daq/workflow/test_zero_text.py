@@ -53,9 +53,8 @@ def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(
     right_deg = 10.0
     said = f"{-too_large_deg:+.2f} ± 0.04° (to be added to its position)"
     typed = (
-        f"add {-too_large_deg:+.2f} to `zero_offset_deg` of {{}} in the cell file, "
-        "which makes "
-        f"it {right_deg:.2f},"
+        f"add {-too_large_deg:+.2f} to `zero_offset_deg` of {{}} in the cell file, which makes it "
+        f"{right_deg:.2f},"
     )
 
     serial = load_cell(checkout / "configs/cells/demo.yaml")

@@ -189,11 +189,12 @@ FITTING: dict[str, set[str]] = {
     "maxon_epos4.eds": {"maxon-epos4"},
     "ros2_canopen_cia402_slave.eds": set(),
 }
+# technosoft-ipos needs an entry of a person.
 PROFILES = sorted(
     path.stem
     for path in (shipped_configurations() / "drives").glob("*.yaml")
     if path.stem != "technosoft-ipos"
-)  # which needs an entry of a person
+)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -83,11 +83,11 @@ def test_in_a_tree_a_joint_moves_its_own_branch_alone() -> None:
     urdf = (
         '<robot name="two"><link name="base"/>'
         + "".join(
-            f'<joint name="q{name}" type="{kind}"><origin xyz="0.1 {y} 0.3" rpy="0.3 0.1 {y}"/>'
-            f'<parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/>'
-            '<limit lower="-3" upper="3" velocity="3" effort="9"/></joint>'
-            f'<link name="{name}"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="2"/>'
-            '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" '
+            f'<joint name="q{name}" type="{kind}"><origin xyz="0.1 {y} 0.3" rpy="0.3 0.1 '
+            f'{y}"/><parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/><limit '
+            'lower="-3" upper="3" velocity="3" effort="9"/></joint><link '
+            f'name="{name}"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="2"/><inertia '
+            'ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" '
             'izz="0.02"/></inertial></link>'
             for name, kind, parent, y, axis in (
                 ("torso", "revolute", "base", "0", "0 0 1"),

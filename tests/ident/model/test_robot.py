@@ -27,8 +27,7 @@ TWO_LINKS = (
     '<robot name="r"><link name="a"/><link '
     'name="b"><inertial>' + BODY + '</inertial></link><joint name="j" '
     'type="revolute"><origin xyz="0 0 1"/><parent link="a"/><child link="b"/><axis '
-    'xyz="0 0 1"/>' + LIMIT + "</joint>"
-    "</robot>"
+    'xyz="0 0 1"/>' + LIMIT + "</joint></robot>"
 )
 
 
@@ -114,9 +113,9 @@ def _with_gripper(finger: str, thumb: str) -> str:
     return TWO_LINKS.replace(
         "</robot>",
         f'<link name="f"><inertial>{BODY}</inertial></link><link '
-        f'name="t"><inertial>{BODY}</inertial></link>'
-        f'<joint name="finger" {finger}<parent link="b"/><child link="f"/></joint>'
-        f'<joint name="thumb" {thumb}<parent link="b"/><child link="t"/></joint></robot>',
+        f'name="t"><inertial>{BODY}</inertial></link><joint name="finger" {finger}<parent '
+        f'link="b"/><child link="f"/></joint><joint name="thumb" {thumb}<parent link="b"/><child '
+        'link="t"/></joint></robot>',
     )
 
 
