@@ -32,7 +32,8 @@ from ident.arrays import FloatArray, IntArray
 from ident.equations.triangles import Triangles, solve, triangle_of
 
 ROUNDS = 30  #: At most; σ and χ depend on each other
-LONG = 20  #: So many rows a column are reduced to a triangle first
+ROWS_FOR_TRIANGLE = 20  #: From so many rows a column on, they are reduced to a triangle first
+SETTLED = 1e-10  #: Relative change of σ from round to round, below which it no longer changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,25 +54,39 @@ class Currents:
     @classmethod
     def of_motors(cls, triangles: Triangles) -> Currents:
         """Take apart the motors' rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i]."""
-        motor = np.repeat(
-            np.arange(len(triangles.factors)), [len(factor) for factor in triangles.factors]
+        factors = triangles.factors
+        count = len(factors)
+        lengths = [len(factor) for factor in factors]
+        motor = np.repeat(np.arange(count), lengths)
+        stacked = np.concatenate(factors)
+        rows = np.arange(len(stacked))
+        drive = np.zeros((len(stacked), count))
+        drive[rows, motor] = stacked[:, 0]
+        return cls(
+            drive=drive,
+            linear=stacked[:, 1:-1],
+            known=stacked[:, -1],
+            motor=motor,
+            rows=triangles.rows,
         )
-        stacked = np.concatenate(triangles.factors)
-        drive = np.zeros((len(stacked), len(triangles.factors)))
-        drive[np.arange(len(stacked)), motor] = stacked[:, 0]
-        return cls(drive, stacked[:, 1:-1], stacked[:, -1], motor, triangles.rows)
 
     def residual(self, gains: FloatArray, parameters: FloatArray) -> FloatArray:
         """e, shape (k,)."""
-        return np.asarray(self.drive @ gains - self.linear @ parameters - self.known)
+        driven = self.drive @ gains
+        explained = self.linear @ parameters
+        return np.asarray(driven - explained - self.known)
 
     def parameters(self, gains: FloatArray) -> FloatArray:
         """χ for given gains, by least squares, shape (p,)."""
-        right = self.drive @ gains - self.known
-        if len(right) < LONG * self.linear.shape[1]:
-            return solve(self.linear, right)[0]
-        factor = triangle_of(np.vstack((self.linear.T, right)))
-        return solve(factor[:, :-1], factor[:, -1])[0]
+        driven = self.drive @ gains
+        torque = driven - self.known
+        if len(torque) < ROWS_FOR_TRIANGLE * self.linear.shape[1]:
+            parameters, _ = solve(self.linear, torque)
+            return parameters
+        columns = np.vstack((self.linear.T, torque))
+        factor = triangle_of(columns)
+        parameters, _ = solve(factor[:, :-1], factor[:, -1])
+        return parameters
 
     def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
         """The equations in units of the noise.
@@ -80,10 +95,15 @@ class Currents:
             gains: of each motor, for D, shape (m,).
             noise: σ of each current [A], shape (m,).
         """
-        unit = (gains * noise)[self.motor]
-        drive = self.drive / unit[:, None]
-        linear = self.linear / unit[:, None]
-        return Currents(drive, linear, self.known / unit, self.motor, self.rows)
+        of_motor = gains * noise
+        unit = of_motor[self.motor]
+        return Currents(
+            drive=self.drive / unit[:, None],
+            linear=self.linear / unit[:, None],
+            known=self.known / unit,
+            motor=self.motor,
+            rows=self.rows,
+        )
 
     def corrected(
         self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
@@ -92,8 +112,9 @@ class Currents:
         the derivative of e to each gain.
         """
         del noise
+        rows = np.arange(len(residual))
         corrected = whitened.drive.copy()
-        corrected[np.arange(len(residual)), self.motor] -= residual / gains[self.motor]
+        corrected[rows, self.motor] -= residual / gains[self.motor]
         return corrected
 
     def noise(
@@ -112,17 +133,21 @@ class Currents:
                 square of v − τ/g needs none.
         """
         del before
-        current_a = self.residual(gains, parameters) / gains[self.motor]
-        square_sum = np.bincount(self.motor, current_a**2, minlength=len(gains))
+        count = len(gains)
+        torque_nm = self.residual(gains, parameters)
+        current_a = torque_nm / gains[self.motor]
+        square_sum = np.bincount(self.motor, current_a**2, minlength=count)
         square_sum[self.rows == 0] = 1.0
-        return np.asarray(np.sqrt(square_sum / np.maximum(self.rows - free / len(gains), 1.0)))
+        freedom = np.maximum(self.rows - free / count, 1.0)
+        return np.asarray(np.sqrt(square_sum / freedom))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
         """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum;
         with preload for this σ.
         """
         del noise
-        size = self.noise(gains, parameters) * np.sqrt(np.maximum(self.rows, 1.0))
+        std = self.noise(gains, parameters)
+        size = std * np.sqrt(np.maximum(self.rows, 1.0))
         return float(self.rows @ np.log(size))
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
@@ -130,11 +155,12 @@ class Currents:
         a fixed point of a few rounds.
         """
         even = np.ones(len(gains))
-        noise = self.noise(gains, self.whitened(gains, even).parameters(gains), free, even)
+        parameters = self.whitened(gains, even).parameters(gains)
+        noise = self.noise(gains, parameters, free, even)
         for _ in range(ROUNDS):
             parameters = self.whitened(gains, noise).parameters(gains)
             updated = self.noise(gains, parameters, free, noise)
-            if np.allclose(updated, noise, rtol=1e-10):
+            if np.allclose(updated, noise, rtol=SETTLED):
                 break
             noise = updated
         return parameters, noise
@@ -157,11 +183,15 @@ class PreloadedCurrents(Currents):
             preload: N of each row, shape (r, m, m − d).
         """
         count = len(rows)
+        rows_of_motor = len(preload)
         stacked = np.concatenate(rows)
-        motor = np.repeat(np.arange(count), len(preload))
-        equations = np.full(count, len(preload))
         return cls(
-            stacked[:, :count], stacked[:, count:-1], stacked[:, -1], motor, equations, preload
+            drive=stacked[:, :count],
+            linear=stacked[:, count:-1],
+            known=stacked[:, -1],
+            motor=np.repeat(np.arange(count), rows_of_motor),
+            rows=np.full(count, rows_of_motor),
+            preload=preload,
         )
 
     def transform(self, gains: FloatArray, noise: FloatArray) -> FloatArray:
@@ -180,21 +210,24 @@ class PreloadedCurrents(Currents):
             return np.asarray(torque).reshape(columns.shape)
 
         return Currents(
-            without_preload(self.drive),
-            without_preload(self.linear),
-            without_preload(self.known),
-            self.motor,
-            self.rows,
+            drive=without_preload(self.drive),
+            linear=without_preload(self.linear),
+            known=without_preload(self.known),
+            motor=self.motor,
+            rows=self.rows,
         )
 
     def corrected(
         self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
     ) -> FloatArray:
         """Take the corrections σ e out of the measured currents."""
-        corrections = noise[:, None] * residual.reshape(len(gains), -1)
+        of_motors = residual.reshape(len(gains), -1)
+        corrections = noise[:, None] * of_motors
+        transform = self.transform(gains, noise)
         # (T_D)_rij c_jr: what the correction of motor j changes in the row of motor i
-        change = np.einsum("rij,jr->irj", self.transform(gains, noise), corrections)
-        return np.asarray(whitened.drive - change.reshape(whitened.drive.shape))
+        change = np.einsum("rij,jr->irj", transform, corrections)
+        drive = whitened.drive
+        return np.asarray(drive - change.reshape(drive.shape))
 
     def noise(
         self,
@@ -206,27 +239,31 @@ class PreloadedCurrents(Currents):
         """σ of each current from its corrections, and from the share of its noise that they show,
         P_ii.
 
-        The corrections of a motor hold only what the preload has left of its noise (variance
+        The corrections of a motor have only what the preload has left of its noise (variance
         components: Förstner, Allgemeine Vermessungs-Nachrichten 86 (1979)).
         """
+        count = len(gains)
         if before is None:
-            noise = np.ones(len(gains))
+            noise = np.ones(count)
             for _ in range(ROUNDS):
                 before = noise
                 noise = self.noise(gains, parameters, free, noise)
-                if np.allclose(before, noise, rtol=1e-10):
+                if np.allclose(before, noise, rtol=SETTLED):
                     break
             return noise
-        residual = self.whitened(gains, before).residual(gains, parameters).reshape(len(gains), -1)
-        visible = np.einsum("rii->i", self.transform(gains, before) * (gains * before))
-        square_sum = np.sum(residual**2, axis=1)
-        return np.asarray(
-            before * np.sqrt(square_sum / np.maximum(visible - free / len(gains), 1.0))
-        )
+        whitened = self.whitened(gains, before)
+        residual = whitened.residual(gains, parameters)
+        square_sum = np.sum(residual.reshape(count, -1) ** 2, axis=1)
+        # Σ_r P_rii, with P = T_D D
+        projection = self.transform(gains, before) * (gains * before)
+        visible = np.einsum("rii->i", projection)
+        freedom = np.maximum(visible - free / count, 1.0)
+        return np.asarray(before * np.sqrt(square_sum / freedom))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
         """½ ‖e‖², for this σ."""
-        residual = self.whitened(gains, noise).residual(gains, parameters)
+        whitened = self.whitened(gains, noise)
+        residual = whitened.residual(gains, parameters)
         return 0.5 * float(residual @ residual)
 
 
@@ -239,7 +276,8 @@ def whitening_transform(preload: FloatArray, gains: FloatArray, noise: FloatArra
         noise: σ of each current [A], shape (m,).
     """
     inverse = 1.0 / (gains * noise)
-    scaled = inverse[:, None] * preload
-    along = np.swapaxes(scaled, 1, 2)
-    projection = np.eye(len(gains)) - scaled @ np.linalg.solve(along @ scaled, along)
+    scaled = inverse[:, None] * preload  # D⁻¹N
+    transposed = np.swapaxes(scaled, 1, 2)  # NᵀD⁻¹
+    components = np.linalg.solve(transposed @ scaled, transposed)
+    projection = np.eye(len(gains)) - scaled @ components
     return np.asarray(projection * inverse)

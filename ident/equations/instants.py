@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning, decimator
+from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
@@ -35,13 +36,13 @@ class Instants:
 
     def every(self, step: int) -> Instants:
         """Every so many of the rows."""
-        motion = self.motion
+        motion = Motion(
+            position_rad=np.ascontiguousarray(self.motion.position_rad[::step]),
+            velocity_rad_s=np.ascontiguousarray(self.motion.velocity_rad_s[::step]),
+            acceleration_rad_s2=np.ascontiguousarray(self.motion.acceleration_rad_s2[::step]),
+        )
         return Instants(
-            motion=Motion(
-                np.ascontiguousarray(motion.position_rad[::step]),
-                np.ascontiguousarray(motion.velocity_rad_s[::step]),
-                np.ascontiguousarray(motion.acceleration_rad_s2[::step]),
-            ),
+            motion=motion,
             current_a=self.current_a[:, ::step],
             use=self.use[:, ::step],
             move=self.move[::step],
@@ -67,21 +68,33 @@ def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Inst
     if count < 1:
         return None
     _, motor_use = row_masks(model, data, conditioning)
-    step = -(-count // ROWS_OF_RUN)
+    step = ceil(count / ROWS_OF_RUN)
     use = motor_use[:, ::step]
     if not use.any():
         return None
-    slow = [
-        np.ascontiguousarray(filter_(state.T)[:, ::step].T)
-        for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
-    ]
-    return Instants(
-        motion=Motion(slow[0], slow[1], slow[2]),
-        current_a=filter_(data.current_a.T)[:, ::step],
-        use=use,
-        move=data.move[filter_.centres(samples)][::step],
-        mounting=None if data.payload is None else data.payload.mounting,
+    motion = Motion(
+        position_rad=_at_every_row(filter_, data.position_rad, step),
+        velocity_rad_s=_at_every_row(filter_, data.velocity_rad_s, step),
+        acceleration_rad_s2=_at_every_row(filter_, data.acceleration_rad_s2, step),
     )
+    current_a = filter_(data.current_a.T)
+    move = data.move[filter_.centres(samples)]
+    mounting = None
+    if data.payload is not None:
+        mounting = data.payload.mounting
+    return Instants(
+        motion=motion,
+        current_a=current_a[:, ::step],
+        use=use,
+        move=move[::step],
+        mounting=mounting,
+    )
+
+
+def _at_every_row(filter_: Decimator, samples: FloatArray, step: int) -> FloatArray:
+    """Decimate a state of the axes to every so many of the rows, time first."""
+    rows = filter_(samples.T)
+    return np.ascontiguousarray(rows[:, ::step].T)
 
 
 def read_instants(
@@ -94,9 +107,8 @@ def read_instants(
     """
     found = list[Instants]()
     for run in runs:
-        instants = instants_of(
-            model, differentiate(run, model.drive_train, conditioning), conditioning
-        )
+        data = differentiate(run, model.drive_train, conditioning)
+        instants = instants_of(model, data, conditioning)
         if instants is not None:
             found.append(instants)
     return tuple(found)

@@ -38,47 +38,45 @@ class Jacobian:
     of which each holds the unknowns of its motor alone.
 
     The equation of a motor near the flange has few of them: less than half of the numbers of the
-    whole matrix are kept.
+    matrix are stored.
     """
 
     parts: tuple[FloatArray, ...]  #: of each motor's rows, columns first, shapes (s_i, rows_i)
-    seen: tuple[IntArray, ...]  #: unknowns that each motor's equation holds, shapes (s_i,)
+    seen: tuple[IntArray, ...]  #: unknowns in each motor's equation, shapes (s_i,)
     width: int  #: number of unknowns, f
 
     def __matmul__(self, step: FloatArray) -> FloatArray:
         """J x, shape (rows,), from x, shape (f,)."""
-        return np.concatenate(
-            [step[seen] @ part for part, seen in zip(self.parts, self.seen, strict=True)]
-        )
+        pairs = zip(self.parts, self.seen, strict=True)
+        return np.concatenate([step[seen] @ part for part, seen in pairs])
 
     def columns(self, chosen: IntArray) -> FloatArray:
         """Some of its columns, shape (rows, k)."""
         own = self.only(chosen)
-        parts = []
+        parts: list[FloatArray] = []
         for part, seen in zip(own.parts, own.seen, strict=True):
-            parts.append(np.zeros((part.shape[1], own.width)))
-            parts[-1][:, seen] = part.T
+            rows = part.shape[1]
+            of_motor = np.zeros((rows, own.width))
+            of_motor[:, seen] = part.T
+            parts.append(of_motor)
         return np.concatenate(parts)
 
     def only(self, chosen: IntArray) -> Jacobian:
         """A copy with some of its columns."""
-        kept = [np.isin(seen, chosen) for seen in self.seen]
-        return Jacobian(
-            tuple(part[keep] for part, keep in zip(self.parts, kept, strict=True)),
-            tuple(
-                np.searchsorted(chosen, seen[keep])
-                for seen, keep in zip(self.seen, kept, strict=True)
-            ),
-            len(chosen),
-        )
+        parts: list[FloatArray] = []
+        numbers: list[IntArray] = []
+        for part, seen in zip(self.parts, self.seen, strict=True):
+            is_chosen = np.isin(seen, chosen)
+            parts.append(part[is_chosen])
+            numbers.append(np.searchsorted(chosen, seen[is_chosen]))
+        return Jacobian(tuple(parts), tuple(numbers), len(chosen))
 
     def on_columns(self, columns: FloatArray) -> FloatArray:
         """JᵀΦ, shape (f, …), from columns on all rows, shape (rows, …)."""
         out = np.zeros((self.width, *columns.shape[1:]))
         ends = np.cumsum([part.shape[1] for part in self.parts])
-        for part, seen, own in zip(
-            self.parts, self.seen, np.split(columns, ends[:-1]), strict=True
-        ):
+        by_motor = np.split(columns, ends[:-1])
+        for part, seen, own in zip(self.parts, self.seen, by_motor, strict=True):
             out[seen] += part @ own
         return out
 
@@ -123,12 +121,13 @@ class Linearisation:
         """Each cluster's number, shape (clusters,), of numbers of the observation's rows that
         clusters do not part.
         """
-        return per_row[self.source[np.unique(self.cluster, return_index=True)[1]]]
+        _, first_rows = np.unique(self.cluster, return_index=True)
+        return per_row[self.source[first_rows]]
 
     def rows_of(self, motor: int) -> slice:
         """Rows of one motor."""
-        first, last = np.searchsorted(self.motor, (motor, motor + 1))
-        return slice(int(first), int(last))
+        first, end = np.searchsorted(self.motor, (motor, motor + 1))
+        return slice(int(first), int(end))
 
     def shown(self, motor: int) -> float:
         """Σ P_ii over a motor's rows: their number, less what internal preload hides of the
@@ -137,36 +136,42 @@ class Linearisation:
         rows = self.rows_of(motor)
         if self.transform is None:
             return float(rows.stop - rows.start)
-        passed = self.transform[self.source[rows], motor, motor]
-        return float(passed.sum() * self.noise[motor] / self.gamma[motor])
+        diagonal = self.transform[self.source[rows], motor, motor]  # of T_D = P D⁻¹
+        return float(diagonal.sum() * self.noise[motor] / self.gamma[motor])
 
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
         """Joint torque columns, shape (m, extra, r), whitened,
-        on the rows of each motor that feels any: (extra, rows).
+        on the rows of each motor that needs any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
             to_motor: T (DriveTrain.to_motor).
         """
-        return self.decorrelated_by_motor([self.whitened_by_motor(torque_nm, to_motor)])[0]
+        whitened = self.whitened_by_motor(torque_nm, to_motor)
+        (decorrelated,) = self.decorrelated_by_motor([whitened])
+        return decorrelated
 
     def whitened_by_motor(
         self, torque_nm: FloatArray, to_motor: FloatArray
     ) -> dict[int, FloatArray]:
         """The same with what runs share still in the columns; see `decorrelated_by_motor`."""
-        felt: dict[int, FloatArray] = {}
+        by_motor: dict[int, FloatArray] = {}
         if self.transform is not None:
             for motor in range(len(self.gamma)):
                 source = self.source[self.rows_of(motor)]
                 torque = torque_nm.take(source, axis=2)
-                felt[motor] = np.einsum("rj,jer->er", self.transform[source, motor], torque)
-            return felt
+                # Σ_j (T_D)_rij τ_jer of motor i, column e and row r
+                by_motor[motor] = np.einsum("rj,jer->er", self.transform[source, motor], torque)
+            return by_motor
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
-                own = torque_nm[joint].take(self.source[self.rows_of(motor)], axis=1)
+                source = self.source[self.rows_of(motor)]
+                own = torque_nm[joint].take(source, axis=1)
                 own *= to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
-                felt[motor] = felt[motor] + own if motor in felt else own
-        return felt
+                if motor in by_motor:
+                    own = by_motor[motor] + own
+                by_motor[motor] = own
+        return by_motor
 
     def decorrelated_by_motor(
         self, each: Sequence[dict[int, FloatArray]]
@@ -175,22 +180,23 @@ class Linearisation:
         all together, because that is faster.
 
         Args:
-            each: columns on the rows of each motor that feels any, of some candidates, shapes
+            each: columns on the rows of each motor that needs any, of some candidates, shapes
                 (extra, rows).
         """
         if self.scatter is None:
             return list(each)
-        found: list[dict[int, FloatArray]] = [{} for _ in each]
+        decorrelated: list[dict[int, FloatArray]] = [{} for _ in each]
         for motor in range(len(self.gamma)):
-            feeling = [number for number, one in enumerate(each) if motor in one]
-            if not feeling:
+            candidates = [number for number, by_motor in enumerate(each) if motor in by_motor]
+            if not candidates:
                 continue
-            columns = [each[number][motor] for number in feeling]
+            columns = [each[number][motor] for number in candidates]
             ends = np.cumsum([len(own) for own in columns])
-            parts = np.split(self.scatter.decorrelate(motor, np.concatenate(columns)), ends[:-1])
-            for number, part in zip(feeling, parts, strict=True):
-                found[number][motor] = part
-        return found
+            stacked = self.scatter.decorrelate(motor, np.concatenate(columns))
+            parts = np.split(stacked, ends[:-1])
+            for number, part in zip(candidates, parts, strict=True):
+                decorrelated[number][motor] = part
+        return decorrelated
 
     def beside_scatter(
         self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray
@@ -203,21 +209,22 @@ class Linearisation:
             to_motor: T (DriveTrain.to_motor).
             run: of each of the observation's rows, shape (r,).
         """
-        motors = range(len(self.gamma))
-        whole = self.whitened(torque_nm, to_motor).T
-        rows = [self.rows_of(motor) for motor in motors]
-        scatter = RunScatter.of(
-            [whole[:, own] for own in rows], [run[self.source[own]] for own in rows]
-        )
-        parts = tuple(scatter.decorrelate(motor, self.jacobian.parts[motor]) for motor in motors)
-        residual = [
-            scatter.decorrelate(motor, self.residual[None, own])[0]
-            for motor, own in enumerate(rows)
-        ]
+        whitened = self.whitened(torque_nm, to_motor).T
+        rows = [self.rows_of(motor) for motor in range(len(self.gamma))]
+        columns = [whitened[:, own] for own in rows]
+        runs = [run[self.source[own]] for own in rows]
+        scatter = RunScatter.of(columns, runs)
+        parts: list[FloatArray] = []
+        residuals: list[FloatArray] = []
+        for motor, own in enumerate(rows):
+            part = scatter.decorrelate(motor, self.jacobian.parts[motor])
+            residual = scatter.decorrelate(motor, self.residual[None, own])
+            parts.append(part)
+            residuals.append(residual[0])
         return replace(
             self,
-            jacobian=replace(self.jacobian, parts=parts),
-            residual=np.concatenate(residual),
+            jacobian=replace(self.jacobian, parts=tuple(parts)),
+            residual=np.concatenate(residuals),
             scatter=scatter,
         )
 
@@ -227,10 +234,11 @@ class Linearisation:
         """
         hessian = sum_of_squares(self.jacobian)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
-        step = linalg.cho_solve(
-            linalg.cho_factor(hessian, lower=True), self.jacobian.on_columns(self.residual)
-        )
-        return replace(self, residual=self.residual - self.jacobian @ step), step
+        factor = linalg.cho_factor(hessian, lower=True)
+        score = self.jacobian.on_columns(self.residual)
+        step = linalg.cho_solve(factor, score)
+        residual = self.residual - self.jacobian @ step
+        return replace(self, residual=residual), step
 
     def decorrelated(self, columns: FloatArray) -> FloatArray:
         """V^(−1/2) times columns, shape (rows,);
@@ -238,10 +246,11 @@ class Linearisation:
         """
         if self.scatter is None:
             return columns
-        parts = [
-            self.scatter.decorrelate(motor, columns[None, self.rows_of(motor)])[0]
-            for motor in range(len(self.gamma))
-        ]
+        parts: list[FloatArray] = []
+        for motor in range(len(self.gamma)):
+            own = columns[None, self.rows_of(motor)]
+            (part,) = self.scatter.decorrelate(motor, own)
+            parts.append(part)
         return np.concatenate(parts)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
@@ -250,16 +259,18 @@ class Linearisation:
         """
         if self.scatter is None:
             return columns
-        parts = [
-            self.scatter.correlate(motor, columns[None, self.rows_of(motor)])[0]
-            for motor in range(len(self.gamma))
-        ]
+        parts: list[FloatArray] = []
+        for motor in range(len(self.gamma)):
+            own = columns[None, self.rows_of(motor)]
+            (part,) = self.scatter.correlate(motor, own)
+            parts.append(part)
         return np.concatenate(parts)
 
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
-        """The same as columns beside the Jacobian, shape (rows, extra)."""
+        """The same as further columns of the Jacobian, shape (rows, extra)."""
+        by_motor = self.felt(torque_nm, to_motor)
         columns = np.zeros((torque_nm.shape[1], len(self.motor)))
-        for motor, own in self.felt(torque_nm, to_motor).items():
+        for motor, own in by_motor.items():
             columns[:, self.rows_of(motor)] = own
         return columns.T
 
@@ -273,44 +284,60 @@ def linearise(
     gains_fixed: bool,
 ) -> Linearisation:
     """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
-    count, width = len(gains), len(gains) + len(parameters)
-    first = count if gains_fixed else 0
+    count = len(gains)
+    width = count + len(parameters)
+    first = 0
+    if gains_fixed:
+        first = count
     used = [np.flatnonzero(use) for use in observation.motor_use]
+    columns_and_rows = zip(observation.motor_columns(), used, strict=True)
+    rows_of_motors = (columns[:, rows].T for columns, rows in columns_and_rows)
+    preload = observation.preload[:, :, used[0]].transpose(2, 0, 1)
     parts: list[FloatArray] = []
     seen: list[IntArray] = []
-    residual, current, squares = [], [], np.zeros(width)
-    rows_of = (
-        columns[:, rows].T for columns, rows in zip(observation.motor_columns(), used, strict=True)
-    )
-    preload = observation.preload[:, :, used[0]].transpose(2, 0, 1)
-    for whole, left, measured in motor_jacobians(rows_of, preload, gains, parameters, noise):
-        squares += np.einsum("rf,rf->f", whole, whole)
-        seen.append(np.flatnonzero(whole[:, first:].any(axis=0)))
-        parts.append(np.ascontiguousarray(whole[:, first + seen[-1]].T))
-        residual.append(left)
-        current.append(measured)
-    norms = np.sqrt(squares[count:])
-    unit = np.concatenate(
-        (gains, np.divide(1.0, norms, where=norms > 0, out=np.ones(len(parameters))))
-    )[first:]
-    for part, held in zip(parts, seen, strict=True):
-        np.multiply(part, unit[held, None], out=part)
+    residuals: list[FloatArray] = []
+    currents: list[FloatArray] = []
+    squares = np.zeros(width)
+    for jacobian, residual, current in motor_jacobians(
+        rows_of_motors, preload, gains, parameters, noise
+    ):
+        squares += np.einsum("rf,rf->f", jacobian, jacobian)  # Σ_r J_rf²
+        own = np.flatnonzero(jacobian[:, first:].any(axis=0))
+        seen.append(own)
+        parts.append(np.ascontiguousarray(jacobian[:, first + own].T))
+        residuals.append(residual)
+        currents.append(current)
+    parameter_unit = _inverse_norms(squares[count:])
+    unit = np.concatenate((gains, parameter_unit))[first:]
+    for part, own in zip(parts, seen, strict=True):
+        np.multiply(part, unit[own, None], out=part)
     source = np.concatenate(used)
+    row_counts = [len(rows) for rows in used]
+    _, cluster = np.unique(observation.move[source], return_inverse=True)
+    transform = None
+    if preload.size:
+        every_preload = observation.preload.transpose(2, 0, 1)
+        transform = whitening_transform(every_preload, gains, noise)
     return Linearisation(
         jacobian=Jacobian(tuple(parts), tuple(seen), width - first),
-        residual=np.concatenate(residual),
-        current=np.concatenate(current),
-        motor=np.repeat(np.arange(count), [len(rows) for rows in used]),
-        cluster=np.unique(observation.move[source], return_inverse=True)[1].astype(np.int64),
+        residual=np.concatenate(residuals),
+        current=np.concatenate(currents),
+        motor=np.repeat(np.arange(count), row_counts),
+        cluster=cluster.astype(np.int64),
         source=source,
         gamma=1.0 / gains,
         noise=noise,
         free=np.arange(first, width),
         scale=unit,
-        transform=whitening_transform(observation.preload.transpose(2, 0, 1), gains, noise)
-        if preload.size
-        else None,
+        transform=transform,
     )
+
+
+def _inverse_norms(squares: FloatArray) -> FloatArray:
+    """1/‖column‖ from ‖column‖²; one for a column that is zero."""
+    norms = np.sqrt(squares)
+    ones = np.ones(len(norms))
+    return np.divide(1.0, norms, where=norms > 0, out=ones)
 
 
 def motor_jacobians(
@@ -329,16 +356,23 @@ def motor_jacobians(
     """
     if not preload.size:
         for motor, own in enumerate(rows):
-            yield *motor_jacobian(own, motor, gains, parameters, noise), own[:, 0] / noise[motor]
+            jacobian, residual = motor_jacobian(own, motor, gains, parameters, noise)
+            current = own[:, 0] / noise[motor]
+            yield jacobian, residual, current
         return
     currents = PreloadedCurrents.of_rows(list(rows), preload)
     whitened = currents.whitened(gains, noise)
     residual = whitened.residual(gains, parameters)
-    jacobian = np.concatenate(
-        (-currents.corrected(gains, noise, whitened, residual), whitened.linear), axis=1
+    corrected = currents.corrected(gains, noise, whitened, residual)
+    jacobian = np.concatenate((-corrected, whitened.linear), axis=1)
+    current = whitened.drive @ gains
+    count = len(gains)
+    yield from zip(
+        np.split(jacobian, count),
+        np.split(residual, count),
+        np.split(current, count),
+        strict=True,
     )
-    parts = (np.split(part, len(gains)) for part in (jacobian, residual, whitened.drive @ gains))
-    yield from zip(*parts, strict=True)
 
 
 def motor_jacobian(
@@ -355,12 +389,14 @@ def motor_jacobian(
         noise: σ of each motor's current [A].
     """
     count = len(gains)
-    torque = rows[:, 1:-1] @ parameters + rows[:, -1]
+    columns = rows[:, 1:-1]
+    torque = columns @ parameters + rows[:, -1]
     scale = 1.0 / (gains[motor] * noise[motor])
     jacobian = np.zeros((len(rows), count + len(parameters)))
     jacobian[:, motor] = -scale / gains[motor] * torque  # ∂(γ τ)/∂g = −γ² τ
-    jacobian[:, count:] = scale * rows[:, 1:-1]
-    return jacobian, rows[:, 0] / noise[motor] - scale * torque
+    jacobian[:, count:] = scale * columns
+    current = rows[:, 0] / noise[motor]
+    return jacobian, current - scale * torque
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
@@ -372,36 +408,49 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
         scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (C, f).
     """
     hessian = grams.sum(axis=0)
-    # In units in which every unknown is seen equally well: kilograms are beside kg m².
-    unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
-    rest = (hessian - grams) * np.outer(unit, unit)
-    return -np.stack(
-        [_solved(matrix, score * unit) * unit for matrix, score in zip(rest, scores, strict=True)]
-    )
+    unit = _even_unit(hessian)
+    hessians_without = (hessian - grams) * np.outer(unit, unit)
+    steps: list[FloatArray] = []
+    for matrix, score in zip(hessians_without, scores, strict=True):
+        step = _solved(matrix, score * unit)
+        steps.append(step * unit)
+    return -np.stack(steps)
+
+
+def _even_unit(hessian: FloatArray) -> FloatArray:
+    """Unit of each unknown in which all are seen equally well, shape (f,):
+    some are in kg, others in kg m².
+    """
+    diagonal = np.diag(hessian)
+    return 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution by Cholesky's factorisation, or by least squares where the matrix is singular."""
     try:
-        return np.asarray(linalg.cho_solve(linalg.cho_factor(matrix, lower=True), right))
+        factor = linalg.cho_factor(matrix, lower=True)
+        return np.asarray(linalg.cho_solve(factor, right))
     except linalg.LinAlgError:  # a direction that only the cluster left out has seen
-        return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
+        solution, *_ = np.linalg.lstsq(matrix, right, rcond=None)
+        return np.asarray(solution)
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
     """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c,
     shape (C, f).
     """
+    count = len(shifts)
     centred = shifts - shifts.mean(axis=0)
-    return np.asarray((len(shifts) - 1) / len(shifts) * (centred.T @ centred))
+    return np.asarray((count - 1) / count * (centred.T @ centred))
 
 
 def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
     """Join neighbouring clusters of a run in pairs, again and again,
     until they are independent of each other.
 
-    Clusters are moves, and pieces of 2 s of longer moves: long beside the noise of drives, but not
-    beside every misfit of a model. The correlation of neighbours, in units in which all unknowns
-    are known equally well, is
+    Clusters are moves, and pieces of 2 s of longer moves: long compared with the noise of drives,
+    but not with every misfit of a model. The correlation of neighbours, in units in which all
+    unknowns are known equally well, is
 
         r = Σ z_cᵀz_c₊₁ / Σ z_cᵀz_c,      z = L⁻¹ s,      L Lᵀ = H,
 
@@ -420,21 +469,34 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     """
     starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
-    unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
+    unit = _even_unit(hessian)
     scaled = hessian * np.outer(unit, unit)
     scaled[np.diag_indices_from(scaled)] += 1e-9  # a direction that no row shows
     lower = np.linalg.cholesky(scaled)
     while True:
-        z = linalg.solve_triangular(lower, (scores * unit).T, lower=True).T
-        products = np.sum(z[1:] * z[:-1], axis=1)[runs[1:] == runs[:-1]]
-        if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
+        scaled_scores = scores * unit
+        z = linalg.solve_triangular(lower, scaled_scores.T, lower=True).T
+        products = np.sum(z[1:] * z[:-1], axis=1)
+        is_same_run = runs[1:] == runs[:-1]
+        products = products[is_same_run]
+        std_error = float(np.linalg.norm(products))
+        if float(products.sum()) <= CORRELATED * std_error:
             return starts
-        first = np.sort(
-            np.concatenate([np.flatnonzero(runs == run)[::2] for run in np.unique(runs)])
-        )
+        first = _every_other_of_run(runs)
         if len(first) < MIN_MOVES_TO_LEAVE_OUT:
             return starts
-        starts, scores, runs = starts[first], np.add.reduceat(scores, first), runs[first]
+        starts = starts[first]
+        scores = np.add.reduceat(scores, first)
+        runs = runs[first]
+
+
+def _every_other_of_run(runs: IntArray) -> IntArray:
+    """Indices of the first, third, … entry of each run, ascending."""
+    chosen: list[IntArray] = []
+    for run in np.unique(runs):
+        of_run = np.flatnonzero(runs == run)
+        chosen.append(of_run[::2])
+    return np.sort(np.concatenate(chosen))
 
 
 def jackknife_covariance(
@@ -467,29 +529,36 @@ def jackknife_covariance(
     Raises:
         TooFewMoves: fewer than MIN_MOVES_TO_LEAVE_OUT.
     """
-    clusters, count, size = len(system.clusters), len(gains), len(gains) + len(parameters)
+    clusters = len(system.clusters)
     if clusters < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(clusters, MIN_MOVES_TO_LEAVE_OUT)
-    free = slice(count if gains_fixed else 0, size)
-    grams, scores = np.zeros((clusters, size, size)), np.zeros((clusters, size))
-    for index, (cluster, own) in enumerate(
-        zip(system.clusters, (recorded or system).clusters, strict=True)
-    ):
-        equations = motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
-        for motor, (jacobian, left, _) in enumerate(equations):
-            same = own[motor] is cluster[motor]
-            residual = (
-                left if same else motor_jacobian(own[motor], motor, gains, parameters, noise)[1]
-            )
+    size = len(gains) + len(parameters)
+    first_free = 0
+    if gains_fixed:
+        first_free = len(gains)
+    free = slice(first_free, size)
+    if recorded is None:
+        recorded = system
+    grams = np.zeros((clusters, size, size))
+    scores = np.zeros((clusters, size))
+    for index, (cluster, own) in enumerate(zip(system.clusters, recorded.clusters, strict=True)):
+        preload = system.preload_of(index)
+        equations = motor_jacobians(cluster, preload, gains, parameters, noise)
+        for motor, (jacobian, residual, _) in enumerate(equations):
             grams[index] += jacobian.T @ jacobian
-            scores[index] += jacobian.T @ residual
+            recorded_residual = residual
+            if own[motor] is not cluster[motor]:
+                _, recorded_residual = motor_jacobian(own[motor], motor, gains, parameters, noise)
+            scores[index] += jacobian.T @ recorded_residual
     runs = np.array([run for run, _ in system.cluster_runs])
-    grams, scores = grams[:, free, free], scores[:, free]
-    starts = independent_blocks(grams, scores, runs)
+    free_grams = grams[:, free, free]
+    free_scores = scores[:, free]
+    starts = independent_blocks(free_grams, free_scores, runs)
+    block_grams = np.add.reduceat(free_grams, starts)
+    block_scores = np.add.reduceat(free_scores, starts)
+    shifts = left_out_shifts(block_grams, block_scores)
     covariance = np.zeros((size, size))
-    covariance[free, free] = scatter_of(
-        left_out_shifts(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
-    )
+    covariance[free, free] = scatter_of(shifts)
     return covariance
 
 
@@ -504,7 +573,7 @@ class MotorRows:
     starts: IntArray  #: first row of each block, counted from the motor's first, shape (blocks,)
     fold: IntArray  #: of each block, ascending, shape (blocks,)
     cluster: IntArray  #: of each block, shape (blocks,)
-    seen: IntArray  #: unknowns that the motor's equation holds, shape (s,)
+    seen: IntArray  #: unknowns in the motor's equation, shape (s,)
     equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
@@ -515,23 +584,26 @@ class MotorRows:
             first, second: columns first, shapes (…, a, rows) and (…, b, rows).
         """
         out = np.empty((len(self.starts), *first.shape[:-1], second.shape[-2]))
-        for product, start, stop in zip(
-            out, self.starts, (*self.starts[1:], first.shape[-1]), strict=True
-        ):
-            np.matmul(
-                first[..., start:stop], np.swapaxes(second[..., start:stop], -1, -2), out=product
-            )
+        for product, block in zip(out, self._blocks(), strict=True):
+            transposed = np.swapaxes(second[..., block], -1, -2)
+            np.matmul(first[..., block], transposed, out=product)
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
         """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,)
         or (p, f).
         """
-        ends = (*self.starts[1:], self.equations.shape[1])
-        blocks = zip(steps, self.starts, ends, strict=True)
-        return np.concatenate(
-            [x[..., self.seen] @ self.equations[:-2, a:b] for x, a, b in blocks], axis=-1
-        )
+        jacobian = self.equations[:-2]
+        parts: list[FloatArray] = []
+        for step, block in zip(steps, self._blocks(), strict=True):
+            parts.append(step[..., self.seen] @ jacobian[:, block])
+        return np.concatenate(parts, axis=-1)
+
+    def _blocks(self) -> Iterator[slice]:
+        """Rows of each block."""
+        row_count = self.equations.shape[1]
+        for start, end in pairwise((*self.starts.tolist(), row_count)):
+            yield slice(start, end)
 
     def by_fold(self, products: FloatArray, count: int) -> FloatArray:
         """Products of each block, shape (blocks, …), summed over each of so many folds,
@@ -545,7 +617,7 @@ class MotorRows:
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """A linearised problem cut into folds of whole moves,
+    """A linearised problem cut into folds of complete moves,
     with everything that cross-validation reuses.
 
     A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over
@@ -553,7 +625,7 @@ class Folds:
     """
 
     linearisation: Linearisation  #: its rows sorted by motor, fold and cluster
-    #: number of whole moves distributed over the folds; a cluster may be only a piece of one
+    #: number of complete moves distributed over the folds; a cluster may be only a piece of one
     moves: int
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
     motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
@@ -578,8 +650,10 @@ class Folds:
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, m)."""
         rows, fold, _, motor = zip(*self.blocks, strict=True)
+        starts = [block.start for block in rows]
+        of_blocks = np.add.reduceat(residual**2, starts)
         total = np.zeros((self.count, len(self.linearisation.gamma)))
-        np.add.at(total, (fold, motor), np.add.reduceat(residual**2, [part.start for part in rows]))
+        np.add.at(total, (fold, motor), of_blocks)
         return total
 
 
@@ -595,98 +669,77 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     Raises:
         TooFewMoves: to leave some out.
     """
-    move_of = (
-        np.arange(problem.cluster_count)
-        if move_of is None
-        else np.unique(move_of, return_inverse=True)[1]
-    )
+    if move_of is None:
+        move_of = np.arange(problem.cluster_count)
+    else:
+        _, move_of = np.unique(move_of, return_inverse=True)
     moves = int(move_of.max()) + 1
     if moves < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
     fold_of = move_of % FOLDS
-    motors, jacobian, width = len(problem.gamma), problem.jacobian, problem.jacobian.width
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
-    orders = [
-        order[problem.rows_of(motor)] - problem.rows_of(motor).start for motor in range(motors)
-    ]
+    orders = _orders_of_motors(problem, order)
     problem = _with_sorted_rows(problem, order, orders)
-    scatter = problem.scatter
-    change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
-    starts = np.flatnonzero(change)
-    rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
-    cluster, motor = problem.cluster[starts], problem.motor[starts]
-    blocks = tuple(
-        zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True)
-    )
-    cluster_hessian = np.zeros((problem.cluster_count, width, width))
-    cluster_score = np.zeros((problem.cluster_count, width))
-    part_hessian, motor_score = np.zeros((FOLDS, motors, width, width)), np.zeros((motors, width))
-    by_motor, sorted_parts = [], list(jacobian.parts)
-    for i in np.unique(motor):
-        here, whole, seen = motor == i, problem.rows_of(int(i)), jacobian.seen[i]
-        equations = np.empty((len(seen) + 2, whole.stop - whole.start))
-        np.take(jacobian.parts[i], orders[i], axis=1, out=equations[:-2], mode="clip")
-        sorted_parts[i], equations[-2] = equations[:-2], problem.residual[whole]
-        own = MotorRows(
-            int(i),
-            whole,
-            starts[here] - whole.start,
-            fold_of[cluster[here]],
-            cluster[here],
-            seen,
-            equations,
-        )
-        by_motor.append(own)
-        products = own.sums(equations[:-2], equations[:-1])
-        grams, scores = products[..., :-1], products[..., -1]
-        cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
-        cluster_score[np.ix_(own.cluster, seen)] += scores
-        part_hessian[:, i][:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
-        motor_score[i, seen] = scores.sum(axis=0)
-    by_fold = part_hessian.sum(axis=1)
-    hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
+    starts = _block_starts(problem)
+    by_motor = _motor_rows(problem, fold_of, starts, orders)
+    sums = _sums_of(by_motor, problem)
+    by_fold = sums.part_hessian.sum(axis=1)
+    hessian = by_fold.sum(axis=0)
+    score = sums.motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
-    factors, scores_without = [], []
-    for k in range(FOLDS):
-        rest = hessian - by_fold[k]
-        # A direction that only this fold sees must not explode: it stays where the whole data put
-        # it.
-        rest[np.diag_indices_from(rest)] += RIDGE * np.diag(hessian)
-        factors.append(linalg.cho_factor(rest, lower=True))
-        scores_without.append(score - cluster_score[fold_of == k].sum(axis=0))
-    steps = [
-        linalg.cho_solve(factor, part) for factor, part in zip(factors, scores_without, strict=True)
-    ]
+    factors: list[tuple[FloatArray, bool]] = []
+    scores_without: list[FloatArray] = []
+    steps: list[FloatArray] = []
+    for fold in range(FOLDS):
+        hessian_without = hessian - by_fold[fold]
+        # A direction that only this fold sees must not explode: it stays where all the data put it.
+        hessian_without[np.diag_indices_from(hessian_without)] += RIDGE * np.diag(hessian)
+        factor = linalg.cho_factor(hessian_without, lower=True)
+        own_score = sums.cluster_score[fold_of == fold].sum(axis=0)
+        score_without = score - own_score
+        factors.append(factor)
+        scores_without.append(score_without)
+        steps.append(linalg.cho_solve(factor, score_without))
     residual = np.empty_like(problem.residual)
-    part_score = np.zeros((FOLDS, motors, width))
+    part_score = np.zeros_like(sums.part_hessian[..., 0])
     for own in by_motor:
-        left = own.equations[-1]
-        left[:] = problem.residual[own.rows] - own.predicted([steps[k] for k in own.fold])
-        residual[own.rows] = left
-        parts = own.by_fold(own.sums(own.equations[:-2], left[None])[..., 0], FOLDS)
-        part_score[:, own.motor][:, own.seen] = parts
-    # Held once, by MotorRows
-    problem = replace(problem, jacobian=replace(jacobian, parts=tuple(sorted_parts)))
-    full_factor = (linalg.cho_factor(hessian, lower=True)[0], True)
+        steps_of_blocks = [steps[fold] for fold in own.fold]
+        own_residual = own.equations[-1]
+        own_residual[:] = problem.residual[own.rows] - own.predicted(steps_of_blocks)
+        residual[own.rows] = own_residual
+        products = own.sums(own.equations[:-2], own_residual[None])
+        part_score[:, own.motor][:, own.seen] = own.by_fold(products[..., 0], FOLDS)
+    problem = _with_sorted_jacobian(problem, by_motor)
+    full_factor = _lower_factor(hessian)
+    estimate_factor = full_factor
+    if problem.scatter is not None:
+        estimate_factor = _estimate_factor(problem, problem.scatter, hessian)
     return Folds(
         linearisation=problem,
         moves=moves,
-        blocks=blocks,
+        blocks=_described_blocks(problem, fold_of, starts),
         motors=tuple(by_motor),
         full_factor=full_factor,
         factors=tuple(factors),
         scores=np.stack(scores_without),
-        cluster_hessian=cluster_hessian,
-        cluster_score=cluster_score,
-        part_hessian=part_hessian,
+        cluster_hessian=sums.cluster_hessian,
+        cluster_score=sums.cluster_score,
+        part_hessian=sums.part_hessian,
         part_score=part_score,
-        motor_score=motor_score,
+        motor_score=sums.motor_score,
         residual=residual,
-        estimate_factor=full_factor
-        if scatter is None
-        else _estimate_factor(problem, scatter, hessian),
+        estimate_factor=estimate_factor,
     )
+
+
+def _orders_of_motors(problem: Linearisation, order: IntArray) -> list[IntArray]:
+    """An order of all rows as one of each motor's rows, counted from its first."""
+    orders: list[IntArray] = []
+    for motor in range(len(problem.gamma)):
+        rows = problem.rows_of(motor)
+        orders.append(order[rows] - rows.start)
+    return orders
 
 
 def _with_sorted_rows(
@@ -696,8 +749,110 @@ def _with_sorted_rows(
     all rows by one order, the scatter by those of each motor.
     """
     sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
-    scatter = None if problem.scatter is None else problem.scatter.sorted(orders)
+    scatter = problem.scatter
+    if scatter is not None:
+        scatter = scatter.sorted(orders)
     return replace(problem, scatter=scatter, **sorted_rows)
+
+
+def _block_starts(problem: Linearisation) -> IntArray:
+    """First row of each block, in sorted rows: cluster or motor change there."""
+    is_new_cluster = np.diff(problem.cluster, prepend=-1) != 0
+    is_new_motor = np.diff(problem.motor, prepend=-1) != 0
+    return np.flatnonzero(is_new_cluster | is_new_motor)
+
+
+def _described_blocks(
+    problem: Linearisation, fold_of: IntArray, starts: IntArray
+) -> tuple[tuple[slice, int, int, int], ...]:
+    """Rows, fold, cluster and motor of each block."""
+    row_count = len(problem.motor)
+    edges = (*starts.tolist(), row_count)
+    rows = [slice(start, end) for start, end in pairwise(edges)]
+    clusters = problem.cluster[starts]
+    folds = fold_of[clusters].tolist()
+    motors = problem.motor[starts].tolist()
+    return tuple(zip(rows, folds, clusters.tolist(), motors, strict=True))
+
+
+def _motor_rows(
+    problem: Linearisation, fold_of: IntArray, starts: IntArray, orders: Sequence[IntArray]
+) -> list[MotorRows]:
+    """Sorted rows of each motor that has any;
+    the place of r in their equations is not filled in yet.
+    """
+    jacobian = problem.jacobian
+    motor_of_block = problem.motor[starts]
+    found: list[MotorRows] = []
+    for motor in np.unique(motor_of_block).tolist():
+        rows = problem.rows_of(motor)
+        seen = jacobian.seen[motor]
+        equations = np.empty((len(seen) + 2, rows.stop - rows.start))
+        np.take(jacobian.parts[motor], orders[motor], axis=1, out=equations[:-2], mode="clip")
+        equations[-2] = problem.residual[rows]
+        own_starts = starts[motor_of_block == motor]
+        cluster = problem.cluster[own_starts]
+        own = MotorRows(
+            motor=motor,
+            rows=rows,
+            starts=own_starts - rows.start,
+            fold=fold_of[cluster],
+            cluster=cluster,
+            seen=seen,
+            equations=equations,
+        )
+        found.append(own)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Sums:
+    """JᵀJ and Jᵀe of parts of the rows, as of `Folds`."""
+
+    cluster_hessian: FloatArray  #: shape (clusters, f, f)
+    cluster_score: FloatArray  #: shape (clusters, f)
+    part_hessian: FloatArray  #: shape (folds, m, f, f)
+    motor_score: FloatArray  #: shape (m, f)
+
+
+def _sums_of(by_motor: Sequence[MotorRows], problem: Linearisation) -> _Sums:
+    """Sums over the rows of each cluster, of each fold and motor, and of each motor."""
+    clusters = problem.cluster_count
+    motors = len(problem.gamma)
+    width = problem.jacobian.width
+    sums = _Sums(
+        cluster_hessian=np.zeros((clusters, width, width)),
+        cluster_score=np.zeros((clusters, width)),
+        part_hessian=np.zeros((FOLDS, motors, width, width)),
+        motor_score=np.zeros((motors, width)),
+    )
+    for own in by_motor:
+        seen = own.seen
+        products = own.sums(own.equations[:-2], own.equations[:-1])  # J [J | e]ᵀ of each block
+        grams = products[..., :-1]
+        scores = products[..., -1]
+        sums.cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
+        sums.cluster_score[np.ix_(own.cluster, seen)] += scores
+        sums.part_hessian[:, own.motor][:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
+        sums.motor_score[own.motor, seen] = scores.sum(axis=0)
+    return sums
+
+
+def _with_sorted_jacobian(problem: Linearisation, by_motor: Sequence[MotorRows]) -> Linearisation:
+    """The same with the Jacobian's rows sorted as the others:
+    views of the equations of each motor.
+    """
+    parts = list(problem.jacobian.parts)
+    for own in by_motor:
+        parts[own.motor] = own.equations[:-2]
+    jacobian = replace(problem.jacobian, parts=tuple(parts))
+    return replace(problem, jacobian=jacobian)
+
+
+def _lower_factor(matrix: FloatArray) -> tuple[FloatArray, bool]:
+    """Cholesky factor L of L Lᵀ, with scipy's flag that it is the lower one."""
+    factor, _ = linalg.cho_factor(matrix, lower=True)
+    return factor, True
 
 
 def _estimate_factor(
@@ -706,9 +861,8 @@ def _estimate_factor(
     """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian,
     from JᵀJ.
     """
-    whole = hessian.copy()
-    for motor, (part, seen) in enumerate(
-        zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)
-    ):
-        whole[np.ix_(seen, seen)] += scatter.shared(motor, part)
-    return linalg.cho_factor(whole, lower=True)[0], True
+    jacobian = problem.jacobian
+    undone = hessian.copy()
+    for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):
+        undone[np.ix_(seen, seen)] += scatter.shared(motor, part)
+    return _lower_factor(undone)

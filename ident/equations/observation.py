@@ -61,10 +61,11 @@ class Observation(Equations):
     def of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows of a joint, shape (p, rows)."""
         parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
+        mounting = self.mounting[rows]
         for index, indices in enumerate(self.payload_columns):
-            parts.append(
-                self.flange[joint][list(indices)][:, rows] * (self.mounting[rows] == index)
-            )
+            columns = self.flange[joint][list(indices)][:, rows]
+            is_mounted = mounting == index
+            parts.append(columns * is_mounted)
         return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
@@ -75,9 +76,10 @@ class Observation(Equations):
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
             weights[index] = payload.known_parameters
-        return np.asarray(
-            np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]])
-        )
+        parameters = weights[self.mounting[rows]]
+        # Σ_p (W_L)_jpr χ_rp of each joint j and row r
+        torque = np.einsum("jpr,rp->jr", self.flange[:, :, rows], parameters)
+        return np.asarray(torque)
 
     def motor_columns(self) -> Iterator[FloatArray]:
         """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first,
@@ -86,14 +88,17 @@ class Observation(Equations):
         Of a redundantly driven robot V_i in place of v_i, shape (m + p + 1, r).
         """
         known = self.known()
+
+        def of_joint(joint: int) -> FloatArray:
+            """[W | W_uL | W_kL χ_kL] of a joint."""
+            return np.concatenate((self.of_joint(joint), known[joint][None]))
+
         for motor, to_motor in enumerate(self.drive_train.to_motor):
             if self.preload.size:
                 current = self.drive[motor]
             else:
                 current = self.current[motor][None]
-            torque = motor_columns(
-                to_motor, lambda joint: np.concatenate((self.of_joint(joint), known[joint][None]))
-            )
+            torque = motor_columns(to_motor, of_joint)
             yield np.concatenate((current, torque))
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
@@ -101,25 +106,28 @@ class Observation(Equations):
         4 through R) [Nm], shape (m, rows).
         """
         if self.preload.size:
-            return np.asarray(np.einsum("amr,m->ar", self.drive[:, :, rows], gains))
-        return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
+            # Σ_m V_amr g_m of each axis a and row r
+            torque = np.einsum("amr,m->ar", self.drive[:, :, rows], gains)
+            return np.asarray(torque)
+        motor_torque = gains[:, None] * self.current[:, rows]
+        return self.drive_train.direction.T @ motor_torque
 
     def only(self, rows: BoolArray | IntArray | slice) -> Observation:
         """Keep some of the rows, in the order of their indices; those of a slice are views."""
-        return replace(self, **{name: getattr(self, name)[..., rows] for name in OBSERVATION_ROWS})
+        chosen = {name: getattr(self, name)[..., rows] for name in OBSERVATION_ROWS}
+        return replace(self, **chosen)
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
         """Add columns to W, torque of shape (m, extra, r) [Nm per unit];
         what preload hides of them is left out.
         """
         if self.preload.size:
+            # (1 − N Nᵀ) of the torque, row by row
             hidden = np.einsum("alr,apr->lpr", self.preload, torque)
-            torque = torque - np.einsum("alr,lpr->apr", self.preload, hidden)
-        return replace(
-            self,
-            columns=self.columns + columns,
-            effects=np.concatenate((self.effects, torque), axis=1),
-        )
+            hidden_torque = np.einsum("alr,lpr->apr", self.preload, hidden)
+            torque = torque - hidden_torque
+        effects = np.concatenate((self.effects, torque), axis=1)
+        return replace(self, columns=self.columns + columns, effects=effects)
 
     def system(self, demanded: Observation | None = None) -> System:
         """Reduce the rows to triangles.
@@ -157,24 +165,26 @@ class Observation(Equations):
 
     def _support(self) -> BoolArray:
         """Mask of the columns of [W | W_L] that each joint has, shape (m, p)."""
-        return np.concatenate([part.any(axis=2) for part in self._parts()], axis=1)
+        masks = [part.any(axis=2) for part in self._parts()]
+        return np.concatenate(masks, axis=1)
 
     def _read_runs(self, demanded: Observation | None) -> Iterator[ReadRun]:
-        """The rows of one run after the other, those of the demanded motion beside them."""
+        """The rows of one run after the other, with those of the demanded motion."""
         for index, name in enumerate(self.runs):
-            chosen = np.flatnonzero(self.run == index)
-            if not len(chosen):
+            indices = np.flatnonzero(self.run == index)
+            if not len(indices):
                 yield name, None, ()
                 continue
-            places: IntArray | slice = chosen
-            if len(chosen) == chosen[-1] - chosen[0] + 1:
-                places = slice(int(chosen[0]), int(chosen[-1]) + 1)  # of a slice, rows are views
-            own = self.only(places)
+            chosen = _as_slice(indices)
+            own = self.only(chosen)
             columns = own._columns()
+            instrument = columns
+            if demanded is not None:
+                instrument = demanded.only(chosen)._columns()
             rows = Rows(
                 current=own.current,
                 standard=columns,
-                instrument=columns if demanded is None else demanded.only(places)._columns(),
+                instrument=instrument,
                 use=own.use,
                 motor_use=own.motor_use,
                 time_s=own.time_s,
@@ -182,8 +192,20 @@ class Observation(Equations):
                 drive=own.drive,
                 preload=own.preload,
             )
+            payload = None
             mounting = int(own.mounting[0])
-            yield name, self.payloads[mounting] if mounting >= 0 else None, (rows,)
+            if mounting >= 0:
+                payload = self.payloads[mounting]
+            yield name, payload, (rows,)
+
+
+def _as_slice(indices: IntArray) -> IntArray | slice:
+    """Ascending indices as a slice where none is left out: the rows of a slice are views."""
+    first = int(indices[0])
+    last = int(indices[-1])
+    if len(indices) == last - first + 1:
+        return slice(first, last + 1)
+    return indices
 
 
 def observe(
@@ -207,48 +229,51 @@ def observe(
     """
     base = list(like.base.independent)
     mountings = [payload.mounting for payload in like.payloads]
-    parts: list[tuple[Rows, FloatArray, FloatArray]] = []
-    run = []
-    move = []
-    mounting = []
-    first_move = 0
-    shared = ("current", "use", "motor_use", "time_s", "drive", "preload")
-    names: list[str] = []
+    parts: list[Rows] = []
+    regressor: list[FloatArray] = []
+    flange: list[FloatArray] = []
+    run: list[IntArray] = []
+    move: list[IntArray] = []
+    mounting: list[IntArray] = []
+    moves_before = 0
     for index, data in enumerate(runs):
         pieces = rows_of(model, data, conditioning) if built is None else built[index]
-        names.append(data.name)
-        last = first_move
-        if data.payload is None:
-            mounted = -1
-        else:
+        mounted = -1
+        if data.payload is not None:
             mounted = mountings.index(data.payload.mounting)
+        moves_so_far = moves_before
         for rows in pieces:
-            parts.append(
-                (rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange]))
-            )
-            move.append(rows.move + first_move)
-            last = int(move[-1].max()) + 1
-            run.append(np.full(len(rows.move), index, dtype=np.int64))
-            mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
-        first_move = last
+            count = len(rows.move)
+            own_move = rows.move + moves_before
+            moves_so_far = int(own_move.max()) + 1
+            parts.append(rows)
+            regressor.append(rows.standard[:, base])
+            flange.append(np.ascontiguousarray(rows.standard[:, model.flange]))
+            move.append(own_move)
+            run.append(np.full(count, index, dtype=np.int64))
+            mounting.append(np.full(count, mounted, dtype=np.int64))
+        moves_before = moves_so_far
+    run_of_row = np.concatenate(run)
     return Observation(
         model=model,
         columns=like.columns[: len(base)],
         base=like.base,
-        regressor=np.concatenate([regressor for _, regressor, _ in parts], axis=2),
-        effects=np.zeros((model.robot.axis_count, 0, sum(map(len, run)))),
-        flange=np.concatenate([flange for _, _, flange in parts], axis=2),
-        run=np.concatenate(run),
+        regressor=np.concatenate(regressor, axis=2),
+        effects=np.zeros((model.robot.axis_count, 0, len(run_of_row))),
+        flange=np.concatenate(flange, axis=2),
+        run=run_of_row,
         move=np.concatenate(move),
         mounting=np.concatenate(mounting),
         payloads=like.payloads,
         payload_columns=like.payload_columns,
-        runs=tuple(names),
+        runs=tuple(data.name for data in runs),
         conditioning=conditioning,
-        **{
-            name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1)
-            for name in shared
-        },
+        current=np.concatenate([rows.current for rows in parts], axis=-1),
+        use=np.concatenate([rows.use for rows in parts], axis=-1),
+        motor_use=np.concatenate([rows.motor_use for rows in parts], axis=-1),
+        time_s=np.concatenate([rows.time_s for rows in parts]),
+        drive=np.concatenate([rows.drive for rows in parts], axis=-1),
+        preload=np.concatenate([rows.preload for rows in parts], axis=-1),
     )
 
 
@@ -266,8 +291,10 @@ def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observat
     base = list(rows.base.independent)
     for index, data in enumerate(datasets):
         if data.demanded is not None:
-            own = rows.run == index
-            asked = demanded_at_rows(data.demanded, row_filter(data, rows.conditioning))
-            standard = model.regressor(asked, loaded=data.payload is not None)
-            regressor[:, :, own], flange[:, :, own] = standard[:, base], standard[:, model.flange]
+            of_run = rows.run == index
+            filter_ = row_filter(data, rows.conditioning)
+            demanded = demanded_at_rows(data.demanded, filter_)
+            standard = model.regressor(demanded, loaded=data.payload is not None)
+            regressor[:, :, of_run] = standard[:, base]
+            flange[:, :, of_run] = standard[:, model.flange]
     return replace(rows, regressor=regressor, flange=flange)

@@ -1,5 +1,5 @@
 """Runs, one after the other, reduced to triangles:
-the observation matrix is never held whole (TSQR).
+the observation matrix is never in memory at once (TSQR).
 
 `reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows
 have, and all ten parameters of the payload of each mounting; `System.holding` then gives some of
@@ -69,14 +69,14 @@ def reduce_runs(
     instruments: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> System:
-    """Reduce runs one after the other; no more than one of them is held.
+    """Reduce runs one after the other; no more than one of them is in memory.
 
     Args:
         model: the declared model.
         runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
-        instruments: keep those of the demanded motion beside the rows; where it is not known, the
+        instruments: add those of the demanded motion to the rows; where it is not known, the
             recorded one serves.
         chunk_rows: rows built at once; the result does not depend on it.
 
@@ -100,9 +100,10 @@ def reduce_built(
 ) -> System:
     """Reduce runs whose rows are built; arguments, result and errors are those of `reduce_runs`."""
     columns = np.arange(len(model.columns))
+    read_runs = ((data.name, data.payload, pieces) for data, pieces in runs)
     return reduce_rows(
         standard_equations(model, payloads),
-        ((data.name, data.payload, pieces) for data, pieces in runs),
+        read_runs,
         support=model.support,
         flange=columns[model.flange],
         instruments=instruments and not model.is_redundant,
@@ -115,9 +116,15 @@ def standard_equations(
 ) -> Equations:
     """The unknowns before any regrouping: every standard parameter, and none of the payloads."""
     names = tuple(column.name for column in model.columns)
-    every = BaseParameters(tuple(range(len(names))), np.eye(len(names)), names)
+    count = len(names)
+    every_parameter = BaseParameters(tuple(range(count)), np.eye(count), names)
     return Equations(
-        model, every, model.columns, tuple(payloads), ((),) * len(payloads), tuple(runs)
+        model=model,
+        base=every_parameter,
+        columns=model.columns,
+        payloads=tuple(payloads),
+        payload_columns=((),) * len(payloads),
+        runs=tuple(runs),
     )
 
 
@@ -145,7 +152,7 @@ def reduce_rows(
             without payloads.
         given: unknowns that get a value, as for `System.holding`, where all payloads are known
             beforehand.
-        instruments: keep those of the demanded motion beside the rows.
+        instruments: add those of the demanded motion to the rows.
         compact: reduce the motors' rows of a move to a triangle, and join moves where there are
             very many.
 
@@ -163,7 +170,9 @@ def reduce_rows(
             reducer.clusters = _joined(reducer.clusters)
     if compact and len(reducer.clusters) > MAX_CLUSTERS:
         reducer.clusters = _joined(reducer.clusters)
-    return reducer.system({} if given is None else given)
+    if given is None:
+        given = {}
+    return reducer.system(given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,11 +206,13 @@ class _Reducer:
         self.flange = flange
         self.instruments = instruments
         self.compact = compact
-        self.model = model = unknowns.model
+        self.model = unknowns.model
         self.leading = unknowns.leading
         self.columns = support.shape[1]
-        self.of_joint = [np.flatnonzero(row) for row in _support_with_currents(model, support)]
-        self.of_motor = [np.flatnonzero(row) for row in motor_support(model.drive_train, support)]
+        joint_support = _support_with_currents(self.model, support)
+        self.of_joint = [np.flatnonzero(row) for row in joint_support]
+        support_of_motors = motor_support(self.model.drive_train, support)
+        self.of_motor = [np.flatnonzero(row) for row in support_of_motors]
         self.payloads = list(unknowns.payloads)
         self.names: list[str] = []
         #: By mounting, −1 without load, the triangle of each joint's rows [V | W].
@@ -214,46 +225,68 @@ class _Reducer:
     def add(self, name: str, payload: Payload | None, pieces: Iterable[Rows]) -> None:
         """Fold in the rows of a run."""
         mounting = mounting_index(payload, self.payloads, name)
-        empty = [np.zeros((len(columns), len(columns))) for columns in self.of_joint]
-        factors = self.joints.setdefault(mounting, empty)
+        factors = self._factors_of(mounting)
         moves: dict[int, list[_Cluster]] = {}
         for rows in pieces:
             for joint, columns in enumerate(self.of_joint):
-                factors[joint] = qr_update(
-                    factors[joint], _rows_of_joint(self.model, rows, joint, columns)
-                )
+                own_rows = _rows_of_joint(self.model, rows, joint, columns)
+                factors[joint] = qr_update(factors[joint], own_rows)
             self.joint_rows += rows.use.sum(axis=1)
             self.motor_rows += rows.motor_use.sum(axis=1)
-            self.has_demanded_motion |= rows.instrument is not rows.standard
-            numbers = np.unique(rows.move[rows.motor_use.any(axis=0)])
-            if not len(numbers):
-                continue  # every motor at standstill
-            by_motor = [self._by_move(rows, motor, numbers) for motor in range(len(self.of_motor))]
-            for move, own in zip(numbers.tolist(), zip(*by_motor, strict=True), strict=True):
-                counted = rows.motor_use[0] & (rows.move == move)
-                preload = rows.preload[:, :, counted].transpose(2, 0, 1)
-                moves.setdefault(move, []).append(_Cluster(mounting, len(self.names), own, preload))
+            if rows.instrument is not rows.standard:
+                self.has_demanded_motion = True
+            for move, cluster in self._clusters_of(rows, mounting):
+                parts = moves.setdefault(move, [])
+                parts.append(cluster)
         for parts in moves.values():
-            self.clusters.append(
-                parts[0] if len(parts) == 1 and not self.compact else _merged(parts)
-            )
+            cluster = parts[0]
+            if len(parts) > 1 or self.compact:
+                cluster = _merged(parts)
+            self.clusters.append(cluster)
         self.names.append(name)
+
+    def _factors_of(self, mounting: int) -> list[FloatArray]:
+        """Triangle of each joint's rows with a mounting, so far; zero where no run had it."""
+        if mounting not in self.joints:
+            widths = [len(columns) for columns in self.of_joint]
+            self.joints[mounting] = [np.zeros((width, width)) for width in widths]
+        return self.joints[mounting]
+
+    def _clusters_of(self, rows: Rows, mounting: int) -> list[tuple[int, _Cluster]]:
+        """Number and motor rows of each move; none where every motor is at standstill."""
+        any_motor = rows.motor_use.any(axis=0)
+        moves = np.unique(rows.move[any_motor])
+        if not len(moves):
+            return []
+        by_motor = [self._by_move(rows, motor, moves) for motor in range(len(self.of_motor))]
+        run = len(self.names)
+        clusters: list[tuple[int, _Cluster]] = []
+        for index, move in enumerate(moves.tolist()):
+            factors = tuple(of_moves[index] for of_moves in by_motor)
+            counted = rows.motor_use[0] & (rows.move == move)
+            preload = rows.preload[:, :, counted].transpose(2, 0, 1)
+            clusters.append((move, _Cluster(mounting, run, factors, preload)))
+        return clusters
 
     def _by_move(self, rows: Rows, motor: int, moves: IntArray) -> list[FloatArray]:
         """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i],
         in the rows of each move.
         """
         to_motor = self.model.drive_train.to_motor[motor]
-        held = self.of_motor[motor]
-        parts = [rows.drive[motor] if self.model.is_redundant else rows.current[motor][None]]
-        parts.append(_held_columns(to_motor, rows.standard, held))
+        chosen = self.of_motor[motor]
+        if self.model.is_redundant:
+            currents = rows.drive[motor]
+        else:
+            currents = rows.current[motor][None]
+        parts = [currents, _chosen_columns(to_motor, rows.standard, chosen)]
         if self.instruments:
-            parts.append(_held_columns(to_motor, rows.instrument, held))
+            parts.append(_chosen_columns(to_motor, rows.instrument, chosen))
         used = np.flatnonzero(rows.motor_use[motor])
-        used = used[np.argsort(rows.move[used], kind="stable")]
+        order = np.argsort(rows.move[used], kind="stable")
+        used = used[order]
         columns = np.concatenate(parts)[:, used]
         ends = np.searchsorted(rows.move[used], moves[1:])
-        return [own.T for own in np.split(columns, ends, axis=1)]
+        return [of_move.T for of_move in np.split(columns, ends, axis=1)]
 
     def system(self, given: Mapping[int, float]) -> System:
         """The equations with all columns but those that are given;
@@ -263,29 +296,38 @@ class _Reducer:
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
             without_clusters = without_clusters.holding(given)
-        # The clusters are by far the largest part: none of them is held twice.
+        # The clusters are by far the largest part: none of them is in memory twice.
         clusters: list[tuple[FloatArray, ...]] = []
         instruments: list[tuple[FloatArray, ...]] = []
         for one in self.clusters:
-            clusters.append(self._of_cluster(one, self._currents, unknowns, self.leading))
+            rows = self._of_cluster(one, self._currents, unknowns, self.leading)
+            clusters.append(rows)
             if self.has_demanded_motion:
-                instruments.append(self._of_cluster(one, self._instruments, unknowns, 0))
+                rows = self._of_cluster(one, self._instruments, unknowns, 0)
+                instruments.append(rows)
         return replace(without_clusters, clusters=tuple(clusters), instruments=tuple(instruments))
 
     def _without_clusters(self) -> System:
         """The equations with all columns, before the rows of each cluster are added."""
+        joints = [self._joint(joint) for joint in range(len(self.of_joint))]
+        motors = [self._motor(motor) for motor in range(len(self.of_motor))]
+        every_parameter = tuple(range(BODY))
+        cluster_runs = [(one.run, one.mounting) for one in self.clusters]
+        preload: list[FloatArray] = []
+        if self.model.is_redundant:
+            preload = [one.preload for one in self.clusters]
         return System(
             model=self.model,
             base=self.unknowns.base,
             columns=self.unknowns.columns,
             payloads=tuple(self.payloads),
-            payload_columns=(tuple(range(BODY)),) * len(self.payloads),
+            payload_columns=(every_parameter,) * len(self.payloads),
             runs=tuple(self.names),
-            joints=Triangles(tuple(map(self._joint, range(len(self.of_joint)))), self.joint_rows),
-            motors=Triangles(tuple(map(self._motor, range(len(self.of_motor)))), self.motor_rows),
+            joints=Triangles(tuple(joints), self.joint_rows),
+            motors=Triangles(tuple(motors), self.motor_rows),
             clusters=(),
-            cluster_runs=tuple((one.run, one.mounting) for one in self.clusters),
-            preload=tuple(one.preload for one in self.clusters) if self.model.is_redundant else (),
+            cluster_runs=tuple(cluster_runs),
+            preload=tuple(preload),
         )
 
     def _joint(self, joint: int) -> FloatArray:
@@ -300,8 +342,10 @@ class _Reducer:
             rows = factors[joint]
             currents = np.zeros((len(rows), count))
             currents[:, columns[:motors]] = rows[:, :motors]
-            linear = self._linear(rows[:, motors:], columns[motors:] - count, mounting)
-            parts.append(np.concatenate((currents, -linear), axis=1))
+            standard = columns[motors:] - count
+            linear = self._linear(rows[:, motors:], standard, mounting)
+            both = np.concatenate((currents, -linear), axis=1)
+            parts.append(both)
         return np.concatenate(parts)
 
     def _motor(self, motor: int) -> FloatArray:
@@ -311,10 +355,10 @@ class _Reducer:
         width = self.leading + len(self.of_motor[motor])
         parts: list[FloatArray] = [np.empty((0, self.leading + self._width))]
         for mounting in self.joints:
-            rows = [
-                one.factors[motor][:, :width] for one in self.clusters if one.mounting == mounting
-            ]
-            parts.append(self._currents(triangle(rows, width), motor, mounting))
+            clusters = [one for one in self.clusters if one.mounting == mounting]
+            rows = [one.factors[motor][:, :width] for one in clusters]
+            factor = triangle(rows, width)
+            parts.append(self._currents(factor, motor, mounting))
         return np.concatenate(parts)
 
     @property
@@ -340,20 +384,23 @@ class _Reducer:
 
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
-        held = self.of_motor[motor]
-        linear = self._linear(rows[:, self.leading : self.leading + len(held)], held, mounting)
-        return np.concatenate((rows[:, : self.leading], linear), axis=1)
+        chosen = self.of_motor[motor]
+        first = self.leading
+        end = first + len(chosen)
+        linear = self._linear(rows[:, first:end], chosen, mounting)
+        return np.concatenate((rows[:, :first], linear), axis=1)
 
     def _instruments(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[Z | Z_L of each mounting | 0] from the columns that a motor has."""
-        held = self.of_motor[motor]
-        return self._linear(rows[:, self.leading + len(held) :], held, mounting)
+        chosen = self.of_motor[motor]
+        first = self.leading + len(chosen)
+        return self._linear(rows[:, first:], chosen, mounting)
 
-    def _linear(self, rows: FloatArray, held: IntArray, mounting: int) -> FloatArray:
+    def _linear(self, rows: FloatArray, chosen: IntArray, mounting: int) -> FloatArray:
         """[W | W_L of each mounting | 0] from some of the columns."""
         robot = len(self.unknowns.columns)
         every = np.zeros((len(rows), self.columns))
-        every[:, held] = rows
+        every[:, chosen] = rows
         out = np.zeros((len(rows), self._width))
         out[:, :robot] = every[:, :robot]
         if mounting >= 0:
@@ -376,36 +423,46 @@ def motor_support(train: DriveTrain, support: BoolArray) -> BoolArray:
     """Mask of the columns of W that the equation of each motor has, from those of each joint,
     both of shape (m, c).
     """
-    mixed = np.abs(train.to_motor) > 0.0
-    return np.asarray(mixed.astype(np.int64) @ support.astype(np.int64) > 0)
+    is_mixed = np.abs(train.to_motor) > 0.0
+    joints_with_column = is_mixed.astype(np.int64) @ support.astype(np.int64)
+    return np.asarray(joints_with_column > 0)
 
 
 def _rows_of_joint(model: Model, rows: Rows, joint: int, columns: IntArray) -> FloatArray:
     """The given columns of [V | W] of a joint, in the rows that count, columns first."""
+    count = len(rows.use)
     used = rows.use[joint]
-    motors = columns[columns < len(rows.use)]
+    motors = columns[columns < count]
     if model.is_redundant:
         currents = rows.drive[joint][:, used]
     else:
-        currents = model.drive_train.direction[motors, joint, None] * rows.current[motors][:, used]
-    standard = columns[len(motors) :] - len(rows.use)
-    return np.concatenate((currents, rows.standard[joint][np.ix_(standard, used)]))
+        direction = model.drive_train.direction[motors, joint]
+        currents = direction[:, None] * rows.current[motors][:, used]
+    standard = columns[len(motors) :] - count
+    own_columns = rows.standard[joint][np.ix_(standard, used)]
+    return np.concatenate((currents, own_columns))
 
 
-def _held_columns(to_motor: FloatArray, columns: FloatArray, held: IntArray) -> FloatArray:
+def _chosen_columns(to_motor: FloatArray, columns: FloatArray, chosen: IntArray) -> FloatArray:
     """(T W)_i in the columns that a motor has, from those of all joints, shape (m, c, r)."""
-    return motor_columns(to_motor, lambda joint: columns[joint][held])
+    return motor_columns(to_motor, lambda joint: columns[joint][chosen])
 
 
 def _merged(parts: Sequence[_Cluster]) -> _Cluster:
     """One cluster of several parts of a run: triangles, or with preload all rows."""
     first = parts[0]
     preload = np.concatenate([one.preload for one in parts])
-    of_motors = zip(*(one.factors for one in parts), strict=True)
-    if preload.size:
-        return replace(first, factors=tuple(map(np.concatenate, of_motors)), preload=preload)
-    factors = tuple(triangle(own, own[0].shape[1]) for own in of_motors)
-    return replace(first, factors=factors, preload=preload[:0])
+    factors: list[FloatArray] = []
+    for motor in range(len(first.factors)):
+        rows = [one.factors[motor] for one in parts]
+        if preload.size:
+            factors.append(np.concatenate(rows))
+        else:
+            width = rows[0].shape[1]
+            factors.append(triangle(rows, width))
+    if not preload.size:
+        preload = preload[:0]
+    return replace(first, factors=tuple(factors), preload=preload)
 
 
 def _joined(clusters: list[_Cluster]) -> list[_Cluster]:
@@ -468,12 +525,13 @@ def regrouped(
     if payload_columns is None:
         payload_columns = shown_payload_columns(standard)
     count = len(standard.columns)
-    given = {index: 0.0 for index in range(count) if index not in base.independent}
-    found = standard.holding(given | payload_values(standard.payloads, payload_columns, count))
-    names = zip(base.names, found.columns, strict=True)
-    return replace(
-        found, base=base, columns=tuple(Column(name, column.unit) for name, column in names)
-    )
+    dependent = {index: 0.0 for index in range(count) if index not in base.independent}
+    known = payload_values(standard.payloads, payload_columns, count)
+    reduced = standard.holding(dependent | known)
+    columns: list[Column] = []
+    for name, column in zip(base.names, reduced.columns, strict=True):
+        columns.append(Column(name, column.unit))
+    return replace(reduced, base=base, columns=tuple(columns))
 
 
 def payload_values(
@@ -488,10 +546,12 @@ def payload_values(
         first: index of the first payload's first parameter among the unknowns.
     """
     values: dict[int, float] = {}
-    for mounting, (payload, unknown) in enumerate(zip(payloads, payload_columns, strict=True)):
-        for index, value in enumerate(payload.known_parameters.tolist()):
+    for payload, unknown in zip(payloads, payload_columns, strict=True):
+        known = payload.known_parameters.tolist()
+        for index, value in enumerate(known):
             if index not in unknown:
-                values[first + BODY * mounting + index] = value
+                values[first + index] = value
+        first += BODY
     return values
 
 
@@ -508,7 +568,8 @@ def shown_base(standard: System) -> BaseParameters:
             raise JointStill(", ".join(standard.runs), (name,), found)
     names = tuple(column.name for column in standard.columns)
     columns = _linear_columns(standard)[:, : len(names)]
-    return base_parameters(_with_one_friction_where_no_row_is_bare(standard.model, columns), names)
+    columns = _with_one_friction_where_no_row_is_bare(standard.model, columns)
+    return base_parameters(columns, names)
 
 
 def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:
@@ -518,9 +579,12 @@ def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -
     if not model.friction_by_payload:
         return columns
     columns = columns.copy()
-    for declared, added in zip(model.friction_columns, model.loaded_friction_columns, strict=True):
-        apart = np.linalg.norm(columns[:, declared] - columns[:, added])
-        if apart <= SMALLEST_COLUMN * np.linalg.norm(columns[:, declared]):
+    pairs = zip(model.friction_columns, model.loaded_friction_columns, strict=True)
+    for declared, added in pairs:
+        declared_column = columns[:, declared]
+        difference = declared_column - columns[:, added]
+        smallest = SMALLEST_COLUMN * np.linalg.norm(declared_column)
+        if np.linalg.norm(difference) <= smallest:
             columns[:, added] = 0.0
     return columns
 
@@ -535,22 +599,29 @@ def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
         first = len(standard.columns) + BODY * mounting
         flange = columns[:, first : first + BODY]
         norms = np.linalg.norm(flange, axis=0)
-        # On a platform that never turns, most of the ten are rounding errors beside the mass.
-        shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
-        unknown = tuple(
-            i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known and shown[i]
-        )
-        names = tuple(LINK_PARAMETERS[i] for i in unknown)
-        if unknown:
-            seen = base_parameters(flange[:, list(unknown)], names).independent
-        else:
-            seen = ()
-        chosen.append(tuple(unknown[i] for i in seen))
+        # On a platform that never turns, most of the ten are rounding errors compared with the
+        # mass.
+        is_shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
+        unknown: list[int] = []
+        for index, name in enumerate(LINK_PARAMETERS):
+            if is_shown[index] and name not in payload.known:
+                unknown.append(index)
+        chosen.append(_independent_payload_columns(flange, unknown))
     return tuple(chosen)
+
+
+def _independent_payload_columns(flange: FloatArray, unknown: list[int]) -> tuple[int, ...]:
+    """Those of some parameters of a payload (LINK_PARAMETERS)
+    whose columns do not depend on each other.
+    """
+    if not unknown:
+        return ()
+    names = tuple(LINK_PARAMETERS[index] for index in unknown)
+    base = base_parameters(flange[:, unknown], names)
+    return tuple(unknown[index] for index in base.independent)
 
 
 def _linear_columns(standard: System) -> FloatArray:
     """[W | W_L of each mounting] of all joints below each other."""
-    return np.concatenate(
-        [-factor[:, standard.axis_count : -1] for factor in standard.joints.factors]
-    )
+    first = standard.axis_count
+    return np.concatenate([-factor[:, first:-1] for factor in standard.joints.factors])

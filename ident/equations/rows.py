@@ -5,7 +5,8 @@ the columns of a motor (paper eq. 5).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from ident.model.robot import Motion
 
 #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 CHUNK_ROWS = 256
+FEWEST_ROWS = 10  #: Rows of the shortest run
 
 
 def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
@@ -26,13 +28,13 @@ def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
     Raises:
         DataUnfit: the run is too short for it.
     """
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    cutoff_hz = conditioning.decimation_cutoff_hz
+    filter_ = decimator(data.rate_hz, cutoff_hz)
     samples = len(data.time_s)
-    if filter_.rows(samples) < 10:
+    if filter_.rows(samples) < FEWEST_ROWS:
+        duration_s = samples / data.rate_hz
         raise DataUnfit(
-            data.name,
-            f"{samples / data.rate_hz:.2g} s are too short to decimate at "
-            f"{conditioning.decimation_cutoff_hz:g} Hz",
+            data.name, f"{duration_s:.2g} s are too short to decimate at {cutoff_hz:g} Hz"
         )
     return filter_
 
@@ -41,23 +43,29 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
     """Parallel decimation of full-rate columns of a run to the observation's rows:
     shape (..., k) → (..., r).
     """
-    return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
+    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    return filter_(columns)
 
 
 def at_rows(data: Dataset, conditioning: Conditioning) -> Dataset:
     """A run at the rows of the equations: motion and clock, and nothing else of it."""
     time_s = decimate_rows(data, conditioning, data.time_s)
-    if data.temperature_c is None:
-        temperature_c = None
-    else:
-        temperature_c = decimate_rows(data, conditioning, data.temperature_c.T).T
+    duration_s = time_s[-1] - time_s[0]
+
+    def decimated(samples: FloatArray) -> FloatArray:
+        """Time first, shape (k, m) → (r, m)."""
+        return decimate_rows(data, conditioning, samples.T).T
+
+    temperature_c = data.temperature_c
+    if temperature_c is not None:
+        temperature_c = decimated(temperature_c)
     return replace(
         data,
-        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
+        rate_hz=float((len(time_s) - 1) / duration_s),
         time_s=time_s,
-        position_rad=decimate_rows(data, conditioning, data.position_rad.T).T,
-        velocity_rad_s=decimate_rows(data, conditioning, data.velocity_rad_s.T).T,
-        acceleration_rad_s2=decimate_rows(data, conditioning, data.acceleration_rad_s2.T).T,
+        position_rad=decimated(data.position_rad),
+        velocity_rad_s=decimated(data.velocity_rad_s),
+        acceleration_rad_s2=decimated(data.acceleration_rad_s2),
         temperature_c=temperature_c,
     )
 
@@ -74,40 +82,53 @@ def row_masks(
     drive_train = model.drive_train
     filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
     # A row's share of standstill is weighted as the filter weights its samples.
-    window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
-    share = conditioning.standstill_share
-    use = (window((~data.moving.T).astype(np.float64)) <= share) & (
-        window((~data.valid.T).astype(np.float64)) == 0.0
-    )
-    motor_still = window((~data.motor_moving.T).astype(np.float64)) > share
+    weights = np.abs(filter_.taps)
+    window = Decimator(weights / weights.sum(), filter_.factor)
+    largest_share = conditioning.standstill_share
+    still_share = _share_without(data.moving, window)
+    invalid_share = _share_without(data.valid, window)
+    use = (still_share <= largest_share) & (invalid_share == 0.0)
+    motor_still = _share_without(data.motor_moving, window) > largest_share
     # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must
     # count.
-    needed = np.abs(drive_train.to_motor) > 0
-    turned = np.abs(drive_train.direction) > 0
-    motor_use = np.stack(
-        [use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))]
-    )
+    is_mixed = np.abs(drive_train.to_motor) > 0
+    is_turned = np.abs(drive_train.direction) > 0
+    motor_use = np.empty_like(use)
+    for motor, still in enumerate(motor_still):
+        joints = is_mixed[motor] | is_turned[motor]
+        motor_use[motor] = use[joints].all(axis=0) & ~still
     # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it
     # turns with.
     for motor in drive_train.coupled:
-        use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
+        stuck = is_turned[motor][:, None] & motor_still[motor][None, :]
+        use &= ~stuck
     if model.is_redundant:
-        use[:] = motor_use[:] = use.all(axis=0) & motor_use.all(axis=0)
+        all_move = use.all(axis=0) & motor_use.all(axis=0)
+        use[:] = all_move
+        motor_use[:] = all_move
     return use, motor_use
 
 
+def _share_without(flags: BoolArray, window: Decimator) -> FloatArray:
+    """Share of each row's samples that do not have a flag, shape (k, m) → (m, r)."""
+    without = ~flags.T
+    return window(without.astype(np.float64))
+
+
 def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]:
-    """Cut a run's samples into pieces that hold the whole windows of at most ``chunk_rows`` rows
-    each.
+    """Cut a run's samples into pieces, each with the complete windows of at most ``chunk_rows``
+    rows.
 
     Pieces end at a block of the decimator, except at the end of the run, so that the filter needs
     no padding.
     """
+    factor = filter_.factor
     rows = filter_.rows(samples)
-    blocks = -(-len(filter_.taps) // filter_.factor)
+    blocks_of_window = ceil(len(filter_.taps) / factor)
     for first in range(0, rows, chunk_rows):
         last = min(first + chunk_rows, rows) - 1
-        yield slice(first * filter_.factor, min((last + blocks) * filter_.factor, samples))
+        end = (last + blocks_of_window) * factor
+        yield slice(first * factor, min(end, samples))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,32 +172,31 @@ def rows_of(
         raise DataUnfit(
             data.name, "no row is left after the standstill and validity masks; did the robot move?"
         )
-    centres = filter_.centres(len(data.time_s))
+    samples = len(data.time_s)
+    centres = filter_.centres(samples)
     time_s = data.time_s[centres] - data.time_s[0]
     move = data.move[centres]
-    first = 0
-    support = model.support
-    if data.demanded is None:
-        asked = None
-    else:
-        asked = demanded_at_rows(data.demanded, filter_)
+    demanded = None
+    if data.demanded is not None:
+        demanded = demanded_at_rows(data.demanded, filter_)
     loaded = data.payload is not None
-    for part in chunks(filter_, len(data.time_s), chunk_rows):
+    first = 0
+    for part in chunks(filter_, samples, chunk_rows):
         if model.is_redundant:
             standard, drive, preload = _balanced(model, data, part, filter_)
         else:
-            regressor = model.regressor(data.motion(part), loaded=loaded)
-            standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
-            standard[support] = filter_(regressor[support])
-            drive = preload = np.empty((len(support), 0, standard.shape[2]))
+            standard = _filtered_regressor(model, data, part, filter_)
+            drive = np.empty((len(standard), 0, standard.shape[2]))
+            preload = drive
         piece = slice(first, first + standard.shape[2])
         first = piece.stop
+        instrument = standard
+        if demanded is not None:
+            instrument = model.regressor(_part(demanded, piece), loaded=loaded)
         yield Rows(
             current=filter_(data.current_a[part].T),
             standard=standard,
-            instrument=standard
-            if asked is None
-            else model.regressor(_part(asked, piece), loaded=loaded),
+            instrument=instrument,
             use=use[:, piece],
             motor_use=motor_use[:, piece],
             time_s=time_s[piece],
@@ -184,6 +204,18 @@ def rows_of(
             drive=drive,
             preload=preload,
         )
+
+
+def _filtered_regressor(model: Model, data: Dataset, part: slice, filter_: Decimator) -> FloatArray:
+    """Columns of the parameters at the joints, shape (m, c, r);
+    those that a joint does not have are zero.
+    """
+    regressor = model.regressor(data.motion(part), loaded=data.payload is not None)
+    support = model.support
+    rows = filter_.rows(regressor.shape[2])
+    filtered = np.zeros((*support.shape, rows))
+    filtered[support] = filter_(regressor[support])
+    return filtered
 
 
 def _balanced(
@@ -196,24 +228,33 @@ def _balanced(
     sample; then, with an A that went through the same filter, they are written as torques of the
     axes.
     """
-    columns, to_motors = model.balance(data.motion(part), loaded=data.payload is not None)
+    loaded = data.payload is not None
+    columns, to_motors = model.balance(data.motion(part), loaded=loaded)
     currents = data.current_a[part].T
-    slow = filter_(to_motors)
-    standard = spread(filter_(columns), slow)
-    drive = spread(filter_(to_motors * currents), slow)
-    return standard, drive, np.ascontiguousarray(preload_directions(slow).transpose(1, 2, 0))
+    filtered_to_motors = filter_(to_motors)
+    standard = spread(filter_(columns), filtered_to_motors)
+    driven = filter_(to_motors * currents)
+    drive = spread(driven, filtered_to_motors)
+    preload = preload_directions(filtered_to_motors).transpose(1, 2, 0)
+    return standard, drive, np.ascontiguousarray(preload)
 
 
 def demanded_at_rows(demanded: Motion, filter_: Decimator) -> Motion:
     """Decimate a demanded motion to the rows:
     it is slow enough for their rate, and an instrument need not be exact.
     """
-    return Motion(*(filter_(getattr(demanded, field.name).T).T for field in fields(Motion)))
+    return Motion(
+        position_rad=filter_(demanded.position_rad.T).T,
+        velocity_rad_s=filter_(demanded.velocity_rad_s.T).T,
+        acceleration_rad_s2=filter_(demanded.acceleration_rad_s2.T).T,
+    )
 
 
 def _part(motion: Motion, rows: slice) -> Motion:
     return Motion(
-        motion.position_rad[rows], motion.velocity_rad_s[rows], motion.acceleration_rad_s2[rows]
+        position_rad=motion.position_rad[rows],
+        velocity_rad_s=motion.velocity_rad_s[rows],
+        acceleration_rad_s2=motion.acceleration_rad_s2[rows],
     )
 
 

@@ -11,7 +11,7 @@ U the left singular vectors of N and λ its squared singular values. Rows multip
 independent errors again (generalised least squares; Aitken, Proc. R. Soc. Edinburgh 55 (1936)): of
 the deviations of whole runs little is left in them, and nothing that a candidate explains of it
 counts. Errors of rows that were left out stay independent of the others, so folds of moves and of
-runs need no change. Deviations of a joint that two motors feel are taken as two.
+runs need no change. Deviations of a joint that two motors turn are taken as two.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ import scipy  # loads scipy.sparse when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
 
-#: Directions up to which zeros are kept: a product is three times as fast, and the memory is little
+#: Directions up to which zeros are stored: a product is three times as fast, and the memory is
+#: little
 MOST_DENSE = 32
 
 
@@ -49,28 +50,15 @@ class RunScatter:
         directions: list[Any] = []
         variances: list[FloatArray] = []
         for own, run in zip(columns, runs, strict=True):
-            seen = own[own.any(axis=1)]
-            unit_rows = [scipy.sparse.csr_array((0, len(run)))]
-            squares = [np.zeros(0)]
-            for number in np.unique(run):
-                rows = np.flatnonzero(run == number)
-                _, size, along = np.linalg.svd(seen[:, rows], full_matrices=False)
-                place = np.broadcast_to(rows, along.shape).ravel()
-                starts = len(rows) * np.arange(len(along) + 1)
-                unit_rows.append(
-                    scipy.sparse.csr_array(
-                        (along.ravel(), place, starts), shape=(len(along), len(run))
-                    )
-                )
-                squares.append(size**2)
-            stacked = scipy.sparse.vstack(unit_rows, format="csr")
-            directions.append(stacked.toarray() if stacked.shape[0] <= MOST_DENSE else stacked)
-            variances.append(np.concatenate(squares))
+            of_motor, own_variances = _directions_of_runs(own, run)
+            directions.append(of_motor)
+            variances.append(own_variances)
         return cls(tuple(directions), tuple(variances))
 
     def decorrelate(self, motor: int, columns: FloatArray) -> FloatArray:
         """V^(−1/2) times columns on the rows of a motor, columns first, shape (p, rows)."""
-        return self._scaled(motor, columns, 1.0 / np.sqrt(1.0 + self.variances[motor]) - 1.0)
+        factors = 1.0 / np.sqrt(1.0 + self.variances[motor]) - 1.0
+        return self._scaled(motor, columns, factors)
 
     def correlate(self, motor: int, columns: FloatArray) -> FloatArray:
         """V times columns on the rows of a motor, columns first, shape (p, rows)."""
@@ -80,16 +68,47 @@ class RunScatter:
         """X (V − 1) Xᵀ of columns on the rows of a motor, columns first, shape (p, rows) → (p,
         p).
         """
-        along = self.directions[motor] @ columns.T
-        return np.asarray(along.T @ (self.variances[motor][:, None] * along))
+        components = self.directions[motor] @ columns.T  # Uᵀ Xᵀ
+        variances = self.variances[motor][:, None]
+        return np.asarray(components.T @ (variances * components))
 
     def sorted(self, orders: Sequence[IntArray]) -> RunScatter:
         """The same for rows of each motor in another order."""
-        moved = tuple(own[:, order] for own, order in zip(self.directions, orders, strict=True))
-        return RunScatter(moved, self.variances)
+        pairs = zip(self.directions, orders, strict=True)
+        directions = [own[:, order] for own, order in pairs]
+        return RunScatter(tuple(directions), self.variances)
 
     def _scaled(self, motor: int, columns: FloatArray, factors: FloatArray) -> FloatArray:
         """X + U diag(f) Uᵀ X, transposed."""
         directions = self.directions[motor]
-        along = factors[:, None] * (directions @ columns.T)
-        return np.asarray(columns + (directions.T @ along).T)
+        components = directions @ columns.T
+        scaled = factors[:, None] * components
+        change = directions.T @ scaled
+        return np.asarray(columns + change.T)
+
+
+def _directions_of_runs(columns: FloatArray, run: IntArray) -> tuple[Any, FloatArray]:
+    """Uᵀ and λ of one motor, shapes (k, rows) and (k,).
+
+    Args:
+        columns: N, whitened, columns first, shape (k, rows).
+        run: of each row, shape (rows,).
+    """
+    row_count = len(run)
+    nonzero = columns.any(axis=1)
+    seen = columns[nonzero]
+    directions = [scipy.sparse.csr_array((0, row_count))]
+    squares = [np.zeros(0)]
+    for number in np.unique(run):
+        rows = np.flatnonzero(run == number)
+        _, sizes, own = np.linalg.svd(seen[:, rows], full_matrices=False)
+        count = len(own)
+        column_indices = np.broadcast_to(rows, own.shape).ravel()
+        starts = len(rows) * np.arange(count + 1)
+        entries = (own.ravel(), column_indices, starts)
+        directions.append(scipy.sparse.csr_array(entries, shape=(count, row_count)))
+        squares.append(sizes**2)
+    stacked: Any = scipy.sparse.vstack(directions, format="csr")
+    if stacked.shape[0] <= MOST_DENSE:
+        stacked = stacked.toarray()
+    return stacked, np.concatenate(squares)

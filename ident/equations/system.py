@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,12 +50,15 @@ class Equations:
 
     @property
     def unknowns(self) -> tuple[Column, ...]:
-        """χ, then χ_uL of each mounting: everything linear that is estimated beside the gains."""
-        return self.columns + tuple(
-            Column(f"{LINK_PARAMETERS[index]}:{payload.mounting}", LINK_UNITS[index])
-            for payload, indices in zip(self.payloads, self.payload_columns, strict=True)
-            for index in indices
-        )
+        """χ, then χ_uL of each mounting: everything linear that is estimated in addition to the
+        gains.
+        """
+        unknowns = list(self.columns)
+        for payload, indices in zip(self.payloads, self.payload_columns, strict=True):
+            for index in indices:
+                name = f"{LINK_PARAMETERS[index]}:{payload.mounting}"
+                unknowns.append(Column(name, LINK_UNITS[index]))
+        return tuple(unknowns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,12 +72,13 @@ class GivenUnknowns:
     @classmethod
     def of(cls, values: Mapping[int, float], count: int) -> GivenUnknowns:
         """From values by index into so many unknowns."""
-        kept = [index for index in range(count + 1) if index not in values]
-        given = [index for index, value in values.items() if value]
+        remaining = [index for index in range(count + 1) if index not in values]
+        nonzero = [index for index, value in values.items() if value]
+        nonzero_values = [values[index] for index in nonzero]
         return cls(
-            np.array(kept, dtype=np.int64),
-            np.array(given, dtype=np.int64),
-            np.array([values[index] for index in given]),
+            kept=np.array(remaining, dtype=np.int64),
+            given=np.array(nonzero, dtype=np.int64),
+            values=np.array(nonzero_values),
         )
 
     def joined_in(self, rows: FloatArray, first: int) -> FloatArray:
@@ -84,10 +88,31 @@ class GivenUnknowns:
             rows: of currents, unknowns and W_kL χ_kL, shape (r, first + count + 1).
             first: number of columns of currents.
         """
-        columns = np.concatenate((np.arange(first), first + self.kept))
+        currents = np.arange(first)
+        columns = np.concatenate((currents, first + self.kept))
         joined = rows[:, columns]
-        joined[:, -1] += rows[:, first + self.given] @ self.values
+        given_columns = rows[:, first + self.given]
+        joined[:, -1] += given_columns @ self.values
         return joined
+
+    def joined_in_triangles(self, triangles: Triangles, first: int) -> Triangles:
+        """The same of triangles, which are made triangular again."""
+        factors: list[FloatArray] = []
+        for factor in triangles.factors:
+            rows = self.joined_in(factor, first)
+            width = rows.shape[1]
+            factors.append(triangle((rows,), width))
+        return Triangles(tuple(factors), triangles.rows)
+
+    def joined_in_clusters(
+        self, clusters: Sequence[Sequence[FloatArray]], first: int
+    ) -> tuple[tuple[FloatArray, ...], ...]:
+        """The same of the rows of each motor in each cluster."""
+        joined: list[tuple[FloatArray, ...]] = []
+        for cluster in clusters:
+            of_motors = [self.joined_in(rows, first) for rows in cluster]
+            joined.append(tuple(of_motors))
+        return tuple(joined)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +129,8 @@ class System(Equations):
     clusters: tuple[tuple[FloatArray, ...], ...]
     #: Of each cluster the index of its run, and that of its payload, −1 without load.
     cluster_runs: tuple[tuple[int, int], ...] = ()
-    #: Beside the rows of each cluster those of its instruments, [(T [Z | Z_uL])_i | (T Z_kL
-    #: χ_kL)_i] of the demanded motion; empty where none is known.
+    #: For each cluster the rows of its instruments, [(T [Z | Z_uL])_i | (T Z_kL χ_kL)_i] of the
+    #: demanded motion; empty where none is known.
     instruments: tuple[tuple[FloatArray, ...], ...] = ()
     #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others
     #: empty.
@@ -117,9 +142,9 @@ class System(Equations):
         """Singular values of W_r with rows of a joint divided by its residual's deviation (paper
         Table 5).
 
-        An effect's coefficient may have any unit, such as rad/Nm beside kg m². Its column is scaled
-        to the median norm of the base parameters' columns: otherwise the condition would depend on
-        that unit.
+        An effect's coefficient may have any unit, such as rad/Nm, where others have kg m². Its
+        column is scaled to the median norm of the base parameters' columns: otherwise the condition
+        would depend on that unit.
 
         Args:
             solution: (g, χ, χ_uL, 1) of eq. (17).
@@ -127,19 +152,28 @@ class System(Equations):
             gains: whether the columns V belong to the unknowns.
         """
         count = self.axis_count
-        matrix = self.joints.stacked(1.0 / self.joints.residual_std(solution, free))
+        residual_std = self.joints.residual_std(solution, free)
+        matrix = self.joints.stacked(1.0 / residual_std)
         norms = np.linalg.norm(matrix, axis=0)
-        base = np.array([column.name in self.base.names for column in self.columns], dtype=np.bool_)
-        if base.any():
-            size = np.median(norms[count + np.flatnonzero(base)])
-            effects = count + np.flatnonzero(~base)
-            matrix[:, effects] *= size / np.where(norms > 0.0, norms, 1.0)[effects]
-        return singular_values(matrix[:, 0 if gains else count : -1])
+        is_base = np.array(
+            [column.name in self.base.names for column in self.columns], dtype=np.bool_
+        )
+        if is_base.any():
+            base = count + np.flatnonzero(is_base)
+            effects = count + np.flatnonzero(~is_base)
+            typical_norm = np.median(norms[base])
+            divisors = np.where(norms > 0.0, norms, 1.0)
+            matrix[:, effects] *= typical_norm / divisors[effects]
+        first = count
+        if gains:
+            first = 0
+        return singular_values(matrix[:, first:-1])
 
     @property
     def seen_runs(self) -> tuple[str, ...]:
         """Names of the runs that have rows here; `runs` may name others of the same observation."""
-        return tuple(self.runs[index] for index in sorted({run for run, _ in self.cluster_runs}))
+        seen = {run for run, _ in self.cluster_runs}
+        return tuple(self.runs[index] for index in sorted(seen))
 
     def preload_of(self, cluster: int) -> FloatArray:
         """N of a cluster's rows, shape (rows, m, m − d);
@@ -154,13 +188,20 @@ class System(Equations):
         """The motors' equations, for maximum likelihood."""
         if not self.model.is_redundant:
             return Currents.of_motors(self.motors)
-        rows = [np.concatenate(own) for own in zip(*self.clusters, strict=True)]
-        return PreloadedCurrents.of_rows(rows, np.concatenate(self.preload))
+        rows: list[FloatArray] = []
+        for of_motor in zip(*self.clusters, strict=True):
+            rows.append(np.concatenate(of_motor))
+        preload = np.concatenate(self.preload)
+        return PreloadedCurrents.of_rows(rows, preload)
 
     @property
     def knows_payload(self) -> bool:
         """Whether any row carries a known payload: the last column of W_tot is not zero."""
-        return any(bool(np.any(factor[:, -1])) for factor in self.joints.factors)
+        for factor in self.joints.factors:
+            known_torque = factor[:, -1]
+            if known_torque.any():
+                return True
+        return False
 
     def holding(self, values: Mapping[int, float]) -> System:
         """Give some unknowns a value: their columns join W_kL χ_kL.
@@ -170,33 +211,23 @@ class System(Equations):
                 §4.2).
         """
         given = GivenUnknowns.of(values, len(self.unknowns))
-
-        def folded(triangles: Triangles, first: int) -> Triangles:
-            factors = (given.joined_in(factor, first) for factor in triangles.factors)
-            return Triangles(tuple(triangle((f,), f.shape[1]) for f in factors), triangles.rows)
-
+        columns = [column for index, column in enumerate(self.columns) if index not in values]
         payload_columns: list[tuple[int, ...]] = []
         first = len(self.columns)
         for indices in self.payload_columns:
-            payload_columns.append(
-                tuple(own for place, own in enumerate(indices, first) if place not in values)
-            )
+            unknown = [
+                parameter for index, parameter in enumerate(indices, first) if index not in values
+            ]
+            payload_columns.append(tuple(unknown))
             first += len(indices)
         return replace(
             self,
-            columns=tuple(
-                column for index, column in enumerate(self.columns) if index not in values
-            ),
+            columns=tuple(columns),
             payload_columns=tuple(payload_columns),
-            joints=folded(self.joints, self.axis_count),
-            motors=folded(self.motors, self.leading),
-            clusters=tuple(
-                tuple(given.joined_in(rows, self.leading) for rows in cluster)
-                for cluster in self.clusters
-            ),
-            instruments=tuple(
-                tuple(given.joined_in(rows, 0) for rows in cluster) for cluster in self.instruments
-            ),
+            joints=given.joined_in_triangles(self.joints, self.axis_count),
+            motors=given.joined_in_triangles(self.motors, self.leading),
+            clusters=given.joined_in_clusters(self.clusters, self.leading),
+            instruments=given.joined_in_clusters(self.instruments, 0),
         )
 
     def on_instruments(self) -> System:
@@ -206,28 +237,31 @@ class System(Equations):
         What is left of a column depends on the demanded motion alone; a disturbance that moved the
         arm is gone from it.
         """
-        projected = []
-        for motor in range(self.axis_count):
-            instruments = np.concatenate([cluster[motor] for cluster in self.instruments])
-            seen = np.flatnonzero(np.any(instruments, axis=0))
-            columns = np.concatenate([cluster[motor][:, 1:] for cluster in self.clusters])
-            both = triangle(
-                (np.concatenate((instruments[:, seen], columns), axis=1),),
-                len(seen) + columns.shape[1],
-            )
-            stage, _ = solve(both[: len(seen), : len(seen)], both[: len(seen), len(seen) :])
-            projected.append(
-                [
-                    np.concatenate((rows[motor][:, :1], known[motor][:, seen] @ stage), axis=1)
-                    for rows, known in zip(self.clusters, self.instruments, strict=True)
-                ]
-            )
-        factors = tuple(triangle(rows, rows[0].shape[1]) for rows in projected)
-        return replace(
-            self,
-            motors=Triangles(factors, self.motors.rows),
-            clusters=tuple(zip(*projected, strict=True)),
-        )
+        projected = [self._projected(motor) for motor in range(self.axis_count)]
+        factors: list[FloatArray] = []
+        for rows in projected:
+            width = rows[0].shape[1]
+            factors.append(triangle(rows, width))
+        motors = Triangles(tuple(factors), self.motors.rows)
+        clusters = tuple(zip(*projected, strict=True))
+        return replace(self, motors=motors, clusters=clusters)
+
+    def _projected(self, motor: int) -> list[FloatArray]:
+        """Rows of a motor in each cluster, [v | Z B] with the B that makes ‖W − Z B‖ least."""
+        instruments = np.concatenate([cluster[motor] for cluster in self.instruments])
+        columns = np.concatenate([cluster[motor][:, 1:] for cluster in self.clusters])
+        seen = np.flatnonzero(np.any(instruments, axis=0))
+        count = len(seen)
+        stacked = np.concatenate((instruments[:, seen], columns), axis=1)
+        # R of [Z | W]: its upper rows hold R_Z and what Z explains of W.
+        upper = triangle((stacked,), stacked.shape[1])[:count]
+        coefficients, _ = solve(upper[:, :count], upper[:, count:])
+        projected: list[FloatArray] = []
+        for cluster, own_instruments in zip(self.clusters, self.instruments, strict=True):
+            current = cluster[motor][:, :1]
+            explained = own_instruments[motor][:, seen] @ coefficients
+            projected.append(np.concatenate((current, explained), axis=1))
+        return projected
 
 
 def require_rows(system: System) -> None:
@@ -236,23 +270,32 @@ def require_rows(system: System) -> None:
     Raises:
         DataUnfit: for a motor.
     """
+    runs = ", ".join(system.runs)
+    unknown_count = len(system.unknowns)
     for motor, rows in enumerate(system.motors.rows):
         if not rows:
-            train = system.drive_train
-            axes = system.model.robot.axes
-            joints = np.flatnonzero((train.direction[motor] != 0) | (train.to_motor[motor] != 0))
+            names = " and ".join(_joints_of_motor(system, motor))
             raise DataUnfit(
-                ", ".join(system.runs),
-                f"{' and '.join(axes[joint].name for joint in joints)}, which motor {motor + 1} "
-                "turns with, never move at the same time; record moves in which they do, or use "
-                "another estimator than ml",
+                runs,
+                f"{names}, which motor {motor + 1} turns with, never move at the same time; record "
+                "moves in which they do, or use another estimator than ml",
             )
-        if rows <= len(system.unknowns):
+        if rows <= unknown_count:
             raise DataUnfit(
-                ", ".join(system.runs),
-                f"motor {motor + 1} has {int(rows)} usable rows for {len(system.unknowns)} "
-                "unknowns; record longer, or move it more",
+                runs,
+                f"motor {motor + 1} has {int(rows)} usable rows for {unknown_count} unknowns; "
+                "record longer, or move it more",
             )
+
+
+def _joints_of_motor(system: System, motor: int) -> list[str]:
+    """Names of the joints that a motor turns with."""
+    train = system.drive_train
+    turned = train.direction[motor] != 0
+    mixed = train.to_motor[motor] != 0
+    joints = np.flatnonzero(turned | mixed)
+    axes = system.model.robot.axes
+    return [axes[joint].name for joint in joints]
 
 
 def require_known_payload(system: System) -> None:
@@ -279,34 +322,55 @@ def require_distinct(system: System, *, gains: bool) -> None:
         RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the
             payload, or a motor's current is constant zero.
     """
-    names = tuple(column.name for column in system.unknowns)
+    dependent = _dependent_unknowns(system)
+    if dependent:
+        remedy = _remedy_of_dependence(system, dependent)
+        raise RankDeficient(f"the data do not distinguish payload and robot: {remedy}", dependent)
+    if gains:
+        _require_currents(system)
+
+
+def _dependent_unknowns(system: System) -> tuple[str, ...]:
+    """Names of the unknowns whose columns depend on those of the others."""
+    names = [column.name for column in system.unknowns]
     columns = np.concatenate([factor[:, system.axis_count :] for factor in system.joints.factors])
     if system.knows_payload:
-        names += (KNOWN_PAYLOAD,)
+        names.append(KNOWN_PAYLOAD)
     else:
         columns = columns[:, :-1]
-    independent = base_parameters(columns, names).independent
-    lost = tuple(name for index, name in enumerate(names) if index not in independent)
-    if lost:
-        is_bare_seen = any(mounting < 0 for _, mounting in system.cluster_runs)
-        if is_bare_seen:
-            missing = "move every joint through more of its range"
-        else:
-            missing = "record the same robot without load too"
-        robot = system.model.robot
-        if is_bare_seen and lost == (KNOWN_PAYLOAD,) and robot.carrier < robot.joint_count - 1:
-            missing = (
-                "what is known of the payload does not show behind so few joints: say more of it, "
-                "as its centre of mass (`centre_m`) beside its mass"
+    independent = base_parameters(columns, tuple(names)).independent
+    return tuple(name for index, name in enumerate(names) if index not in independent)
+
+
+def _remedy_of_dependence(system: System, dependent: tuple[str, ...]) -> str:
+    """What to record, or to say of the payload, where unknowns depend on each other."""
+    is_bare_seen = any(mounting < 0 for _, mounting in system.cluster_runs)
+    if not is_bare_seen:
+        return "record the same robot without load too"
+    robot = system.model.robot
+    has_few_joints = robot.carrier < robot.joint_count - 1
+    if has_few_joints and dependent == (KNOWN_PAYLOAD,):
+        return (
+            "what is known of the payload does not show behind so few joints: say more of it, as "
+            "its centre of mass (`centre_m`) beside its mass"
+        )
+    return "move every joint through more of its range"
+
+
+def _require_currents(system: System) -> None:
+    """Refuse a motor whose current is zero in all of its rows.
+
+    Raises:
+        RankDeficient: for its gain.
+    """
+    for motor, factor in enumerate(system.motors.factors):
+        column = 0
+        if system.leading > 1:
+            column = motor
+        is_zero = not np.any(factor[:, column])
+        if system.motors.rows[motor] and is_zero:
+            name = f"gain {motor + 1}"
+            raise RankDeficient(
+                f"the current of motor {motor + 1} is zero throughout: is its channel connected?",
+                (name,),
             )
-        raise RankDeficient(f"the data do not distinguish payload and robot: {missing}", lost)
-    if gains:
-        for motor, factor in enumerate(system.motors.factors):
-            own = motor if system.leading > 1 else 0
-            if system.motors.rows[motor] and not np.any(factor[:, own]):
-                name = f"gain {motor + 1}"
-                raise RankDeficient(
-                    f"the current of motor {motor + 1} is zero throughout: is its channel "
-                    "connected?",
-                    (name,),
-                )

@@ -1,8 +1,8 @@
 """Rows reduced to triangles, however many there were.
 
 R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never
-held whole. R is unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step is
-Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a
+in memory at once. R is unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step
+is Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a
 backward error of some ε ‖column‖ in every column, whatever the condition number. The Gram matrix is
 twice as fast and squares the condition number: singular values below √ε ‖W‖ are lost in it
 (docs/evidence has both, measured).
@@ -37,20 +37,22 @@ class Triangles:
 
     def stacked(self, weight: FloatArray) -> FloatArray:
         """All axes below each other, each scaled by its weight."""
-        return np.concatenate(
-            [factor * scale for factor, scale in zip(self.factors, weight, strict=True)]
-        )
+        pairs = zip(self.factors, weight, strict=True)
+        return np.concatenate([factor * scale for factor, scale in pairs])
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
         """Standard deviation of each axis' residual R x;
         ``free`` parameters are shared among the axes (eq. 9).
         """
-        size = self.square_sum(vector)
-        return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(self.rows), 1.0)))
+        square_sum = self.square_sum(vector)
+        share = free / len(self.rows)
+        freedom = np.maximum(self.rows - share, 1.0)
+        return np.asarray(np.sqrt(square_sum / freedom))
 
     def square_sum(self, vector: FloatArray) -> FloatArray:
         """‖R x‖² of each axis, shape (m,)."""
-        return np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
+        residuals = [factor @ vector for factor in self.factors]
+        return np.array([float(np.sum(residual**2)) for residual in residuals])
 
 
 def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
@@ -60,39 +62,43 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
         parts: pieces of rows, each of shape (r, columns).
         columns: c, for the case of no rows.
     """
-    rows = np.concatenate([np.empty((0, columns)), *parts])
-    if len(rows) > columns:
-        return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
-    return rows
+    no_rows = np.empty((0, columns))
+    rows = np.concatenate([no_rows, *parts])
+    if len(rows) <= columns:
+        return rows
+    factor = np.linalg.qr(rows, mode="r")
+    return np.asarray(factor, dtype=np.float64)
 
 
 def triangle_of(columns: FloatArray) -> FloatArray:
     """R of rows that are given column by column, shape (c, k) → (≤c, c);
     columns that are zero take no part.
     """
-    held = np.flatnonzero(columns.any(axis=1))
-    out = np.zeros((len(held), len(columns)))
-    out[:, held] = qr_update(None, columns[held])
+    nonzero = np.flatnonzero(columns.any(axis=1))
+    out = np.zeros((len(nonzero), len(columns)))
+    out[:, nonzero] = qr_update(None, columns[nonzero])
     return out
 
 
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
 
-    Scaling columns changes no least-squares solution, but spares digits where kilograms are beside
-    kg m².
+    Scaling columns changes no least-squares solution, but spares digits where one is in kg and
+    another in kg m².
     """
     norms = np.linalg.norm(matrix, axis=0)
     norms[norms == 0.0] = 1.0
     u, s, vt = np.linalg.svd(matrix / norms, full_matrices=False)
-    keep = s > s[0] * 1e-13
-    half = vt[keep].T / s[keep] / norms[:, None]
-    return half @ (u[:, keep].T @ right), half @ half.T
+    is_seen = s > s[0] * 1e-13
+    half = vt[is_seen].T / s[is_seen] / norms[:, None]
+    solution = half @ (u[:, is_seen].T @ right)
+    return solution, half @ half.T
 
 
 def singular_values(matrix: FloatArray) -> FloatArray:
     """Singular values in decreasing order."""
-    return np.asarray(np.linalg.svd(matrix, compute_uv=False), dtype=np.float64)
+    values = np.linalg.svd(matrix, compute_uv=False)
+    return np.asarray(values, dtype=np.float64)
 
 
 def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
@@ -111,23 +117,19 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
         ValueError: the number of columns is not that of the triangle.
     """
     count, rows = columns.shape
-    if triangle is not None and triangle.shape != (count, count):
+    if triangle is None:
+        triangle = np.zeros((count, count))
+    if triangle.shape != (count, count):
         raise ValueError(
             f"expected {triangle.shape[0]} columns, as in the rows before, found {count}"
         )
     if not count or not rows:
-        if triangle is None:
-            return np.zeros((count, count))
         return triangle
-    if triangle is None:
-        out = np.zeros((count, count), order="F")
-    else:
-        out = np.array(triangle, order="F")
+    reflectors = min(REFLECTORS, count)
+    out = np.array(triangle, order="F")
     for first in range(0, rows, BLOCK_ROWS):
         # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a
         # transposition.
         block = np.array(columns[:, first : first + BLOCK_ROWS], order="C")
-        out = lapack.dtpqrt(0, min(REFLECTORS, count), out, block.T, overwrite_a=1, overwrite_b=1)[
-            0
-        ]
+        out, *_ = lapack.dtpqrt(0, reflectors, out, block.T, overwrite_a=1, overwrite_b=1)
     return np.triu(out)

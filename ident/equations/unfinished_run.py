@@ -91,7 +91,9 @@ def new_rows(
     shortest = ceil(SHORTEST_S * before.rate_hz) + len(filter_.taps)
     if samples < shortest and not is_complete:
         return NewRows(before, None)
-    waiting = 0 if is_complete else settled
+    waiting = settled
+    if is_complete:
+        waiting = 0
     # Central differences leave the first and the last sample out.
     end = filter_.rows(samples - 2 - waiting)
     if end <= before.rows and before.rows:
@@ -114,10 +116,10 @@ def new_rows(
     counts = motor_use.any(axis=0)
     moves_before = move[counts & (rows < before.rows)]
     moves_now = move[counts & is_new]
-    continues = (
-        len(moves_before) > 0 and len(moves_now) > 0 and bool(moves_before[-1] == moves_now[0])
-    )
-    return NewRows(progress, (data, pieces), continues)
+    continues_move = False
+    if len(moves_before) and len(moves_now):
+        continues_move = bool(moves_before[-1] == moves_now[0])
+    return NewRows(progress, (data, pieces), continues_move)
 
 
 def _samples_from(run: Run, first: int) -> Run:

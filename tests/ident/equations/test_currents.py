@@ -9,7 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ident.arrays import FloatArray
-from ident.equations.currents import LONG, Currents, PreloadedCurrents, whitening_transform
+from ident.equations.currents import (
+    ROWS_FOR_TRIANGLE,
+    Currents,
+    PreloadedCurrents,
+    whitening_transform,
+)
 from ident.equations.triangles import Triangles
 
 GAINS = np.array([12.0, -5.0, 3.0])
@@ -55,7 +60,7 @@ def test_the_residual_is_the_torque_of_the_currents_less_that_of_the_model(
     assert_allclose(residual, expected.ravel(), atol=1e-12)
 
 
-@pytest.mark.parametrize("rows", [LONG // 3 - 1, 5 * LONG])
+@pytest.mark.parametrize("rows", [ROWS_FOR_TRIANGLE // 3 - 1, 5 * ROWS_FOR_TRIANGLE])
 def test_parameters_are_those_of_least_squares_for_few_and_for_many_rows(rows: int) -> None:
     currents = Recording(rows).currents()
     right = currents.drive @ GAINS - currents.known
