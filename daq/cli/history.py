@@ -332,11 +332,11 @@ def _say_names(history: History, cell_file: Path) -> None:
         _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
     if history.renamed is not None:
         _LOG.warning(
-            "this cell was renamed: found the name %r, expected %r, since %s; give the cell file "
-            "with that name",
+            "this cell was renamed: found the name %r, expected %r, since %s; %s",
             history.renamed.old,
             history.renamed.new,
             history.renamed.at,
+            history.renamed.remedy,
         )
     for name in history.possible_names:
         command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"

@@ -33,7 +33,14 @@ from daq.ledger.audit import (
     witnessed_writes,
 )
 from daq.ledger.dates import corrected, times_by_order
-from daq.ledger.names import RenamedCell, drives_of, names_in, renamed_to, with_present_names
+from daq.ledger.names import (
+    RenamedCell,
+    drives_of,
+    names_in,
+    rename_of,
+    renamed_to,
+    with_present_names,
+)
 from ident.calibration import CalibratedRobot, Calibration, Gain, Source
 
 
@@ -745,6 +752,26 @@ def shown_writes(
     return [
         one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown
     ]
+
+
+def name_after_renames(entries: Sequence[AuditEntry], name: str, since: datetime) -> str:
+    """Return the name that a cell has after the renames that were entered since a time.
+
+    Args:
+        entries: of the audit log, oldest first.
+        name: of the cell at that time.
+        since: the time, with zone.
+    """
+    times = _times_by_number(entries)
+    found = name
+    for one in entries:
+        rename = rename_of(one)
+        if rename is None or rename.old != found:
+            continue
+        renamed_at = times.get(one.number)
+        if renamed_at is not None and renamed_at >= since:
+            found = rename.new
+    return found
 
 
 def at_of(entry: AuditEntry) -> datetime | None:

@@ -51,6 +51,7 @@ from daq.ledger.fold import (
     figures_of,
     fold,
     iso,
+    name_after_renames,
     shown_writes,
     unknown_writes,
 )
@@ -172,17 +173,24 @@ def read_history(ledger: Ledger) -> History:
     return replace(history, may_lack=not verdict.holds)
 
 
-def names_of(cell: Cell) -> frozenset[str]:
-    """Return the name of a cell, and those that it had before its audit log says that it was
-    renamed.
+def present_name(cell: Cell, name: str, at: datetime) -> str:
+    """Return the name that a cell has now by an audit log, which had another name at a time.
+
+    A name that a rename has freed may be another cell's: what was made under it before the rename
+    is of the renamed cell, and what was made later is not.
+
+    Args:
+        cell: whose audit log is read.
+        name: of any cell in that log, at the time.
+        at: time, with zone.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
     """
     ledger = Ledger.of(cell)
     if ledger is None:
-        return frozenset({cell.name})
-    return former_names(verify(ledger.audit).intact, cell.name) | {cell.name}
+        return name
+    return name_after_renames(verify(ledger.audit).intact, name, at)
 
 
 def is_damaged(audit: Path) -> bool:
@@ -641,7 +649,7 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
             f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
         )
         expected = f"{history.renamed.new!r}, its name since"
-        remedy = "give the cell file with the new name; nothing was entered"
+        remedy = f"{history.renamed.remedy}; nothing was entered"
     elif history.other_robots:
         found = str(history.other_robots[0])
         expected = "calibrations of one robot in a history"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -27,8 +27,8 @@ from daq.ledger.ledger import (
     Ledger,
     acknowledge,
     enter_calibration,
-    names_of,
     plan_rename,
+    present_name,
     read_history,
     read_standing,
     record_session,
@@ -363,13 +363,35 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert "drivegain-recalibrate-demo.timer" in captured.err
     assert len(sessions(sessions_folder(cell_file), "press")) == 1
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
-    assert names_of(load_cell(cell_file)) == {"press", "demo"}
+    press = load_cell(cell_file)
+    assert present_name(press, "demo", BEGIN) == "press"
+    assert present_name(press, "demo", datetime.now(UTC)) == "demo"
+    assert present_name(press, "press", BEGIN) == "press"
     # A copy of the cell file with the old name, as a schedule may have.
     cell_file.write_text(
         cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
     )
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
+    assert "if it is another robot, give it another name, or another audit log" in caplog.text
+
+
+def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
+    ledger: Ledger, renamed: Ledger
+) -> None:
+    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    twin = _made(ledger.cell, 12)
+    with pytest.raises(DataError, match="which this robot had until") as caught:
+        _enter(ledger, twin, 12)
+    assert "if it is another robot, give it another name, or another audit log" in str(caught.value)
+    # Either way is one that works.
+    named = _named(ledger, "twin")
+    _enter(named, replace(twin, cell="twin"), 12)
+    assert len(read_history(named).entries) == 1
+    elsewhere = replace(ledger, audit=ledger.audit.with_name("twin.audit.jsonl"))
+    _enter(elsewhere, twin, 12)
+    assert len(read_history(elsewhere).entries) == 1
+    assert read_history(elsewhere).renamed is None
 
 
 def test_the_verb_says_in_what_another_robot_differs(
