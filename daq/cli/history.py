@@ -26,6 +26,7 @@ from daq.errors import (
     UsageError,
     counted,
     evidence,
+    first_few,
 )
 from daq.files import sha256
 from daq.report.text import printable
@@ -330,6 +331,14 @@ def _say_names(history: History, cell_file: Path) -> None:
     more = len(history.other_robots) - _SHOWN
     if more > 0:
         _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
+    if history.not_compared:
+        texts = [printable(str(one)) for one in history.not_compared]
+        _LOG.warning(
+            "%s left out of tables, drift and alarms, for other axes or units than the newest one: "
+            "%s",
+            counted(len(texts), "calibration"),
+            first_few(texts, _SHOWN, " (--json has all)"),
+        )
     if history.renamed is not None:
         _LOG.warning(
             "this cell was renamed: found the name %r, expected %r, since %s; %s",

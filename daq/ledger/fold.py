@@ -124,6 +124,35 @@ class ForeignEntry:
 
 
 @dataclass(frozen=True, slots=True)
+class IncomparableEntry:
+    """A calibration of this cell with other axes or units than the newest one.
+
+    Earlier versions entered such ones into one history.
+    """
+
+    entry: Entry  #: itself
+    expected: Mapping[str, str]  #: unit of each axis in the newest calibration
+
+    def __str__(self) -> str:
+        found = _units(self.entry)
+        if found.keys() != self.expected.keys():
+            found_text = f"gains of {', '.join(found)}"
+            expected_text = f"of {', '.join(self.expected)}"
+        else:
+            differing = [axis for axis, unit in found.items() if unit != self.expected[axis]]
+            found_text = _units_text(differing, found)
+            expected_text = _units_text(differing, self.expected)
+        return (
+            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is not "
+            f"compared: found {found_text}; expected {expected_text}, as in the newest one"
+        )
+
+
+def _units_text(axes: Sequence[str], units: Mapping[str, str]) -> str:
+    return ", ".join(f"{axis} in {units[axis]}" for axis in axes)
+
+
+@dataclass(frozen=True, slots=True)
 class Acknowledgement:
     """A change that a person has explained; a new baseline begins."""
 
@@ -282,10 +311,20 @@ class History:
     #: Calibrations of another robot with the cell's name, oldest first. No change of a gain is
     #: computed with them.
     other_robots: tuple[ForeignEntry, ...] = ()
+    #: Calibrations with other axes or units than the newest one, oldest first. No change of a gain
+    #: is computed with them.
+    not_compared: tuple[IncomparableEntry, ...] = ()
     renamed: RenamedCell | None = None  #: the rename by which this same robot has another name now
     #: Names in the same audit log whose calibrations are all of a robot like this one, where the
     #: cell has none.
     possible_names: tuple[str, ...] = ()
+
+    @property
+    def digests(self) -> frozenset[str]:
+        """SHA-256 of every calibration, also of those that no change of a gain is computed with."""
+        foreign = [one.entry for one in self.other_robots]
+        incomparable = [one.entry for one in self.not_compared]
+        return frozenset(entry.digest for entry in (*self.entries, *foreign, *incomparable))
 
     def in_force(self, target: str | None = None) -> str | None:
         """Return the digest of the calibration in a target, or in the last written one;
@@ -403,7 +442,13 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         else:
             own.append(entry)
     last = _units(own[-1]) if own else {}
-    comparable = [one for one in own if _units(one) == last]
+    comparable = []
+    incomparable = []
+    for entry in own:
+        if _units(entry) == last:
+            comparable.append(entry)
+        else:
+            incomparable.append(IncomparableEntry(entry, last))
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
@@ -411,6 +456,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         acceptances=acceptances,
         unreadable=tuple(unreadable),
         other_robots=tuple(foreign),
+        not_compared=tuple(incomparable),
         renamed=_rename_of_robot(entries, cell.name, robot),
         possible_names=() if calibrations else _names_of_robot(entries, robot),
     )
@@ -497,9 +543,7 @@ def _named(one: EnteredCalibration) -> str:
 
 
 def _units(entry: Entry) -> dict[str, str]:
-    """Return the axes with their units; calibrations with other ones are of a history that an
-    earlier version began.
-    """
+    """Return the axes with their units."""
     return {gain.axis: gain.unit for gain in entry.gains}
 
 

@@ -221,9 +221,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
-    known = {one.digest for one in history.entries} | {
-        one.entry.digest for one in history.other_robots
-    }
+    known = history.digests
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
     is_noted = bool(noted) or not verdict.entries
     return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
@@ -383,13 +381,15 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
             remedy="give its earlier name as the audit log has it, or correct `history.audit` of "
             "the cell file",
         )
+    incomparable = [one.entry for one in under_old.not_compared]
+    calibrations = [*under_old.entries, *incomparable]
     return PlannedRename(
         old=old,
         new=new,
-        calibrations=len(under_old.entries),
+        calibrations=len(calibrations),
         writes=len(under_old.events),
         acknowledgements=len(under_old.acknowledgements),
-        undescribed=sum(entry.robot is None for entry in under_old.entries),
+        undescribed=sum(entry.robot is None for entry in calibrations),
         entered_at=_entered_rename_at(entries, old, new) if is_entered else None,
     )
 

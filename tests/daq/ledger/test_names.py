@@ -22,7 +22,8 @@ from daq.errors import DataError, ExitCode
 from daq.files import sha256
 from daq.jobs.position import sessions_folder
 from daq.jobs.session import Basis, begin, rename_sessions, sessions
-from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger.audit import AuditAction, append, read, verify
+from daq.ledger.fold import figures_of
 from daq.ledger.ledger import (
     Ledger,
     acknowledge,
@@ -392,6 +393,57 @@ def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
     _enter(elsewhere, twin, 12)
     assert len(read_history(elsewhere).entries) == 1
     assert read_history(elsewhere).renamed is None
+
+
+def _enter_unchecked(ledger: Ledger, calibration: Calibration, at: datetime) -> str:
+    """Enter a calibration as earlier versions did, which compared neither axes nor units."""
+    digest = digest_of(calibration)
+    details = {
+        "sha256": digest,
+        "cell": ledger.cell.name,
+        "entered": at.isoformat(),
+        "figures": figures_of(calibration, digest, at),
+    }
+    append(
+        ledger.audit,
+        AuditAction.CALIBRATION_ENTERED,
+        at=at,
+        who="anna",
+        subject=f"history of {ledger.cell.name}",
+        details=details,
+    )
+    return digest
+
+
+def test_calibrations_with_other_axes_or_units_are_counted_and_their_writes_known(
+    cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = Ledger.of(load_cell(cell_file))
+    assert ledger is not None
+    four = _made(ledger.cell, 3)
+    four = replace(four, gains=four.gains[:4])
+    milli = _made(ledger.cell, 4)
+    first = replace(milli.gains[0], unit="Nm/mA")
+    milli = replace(milli, gains=(first, *milli.gains[1:]))
+    digests = []
+    for week, calibration in ((3, four), (4, milli)):
+        at = BEGIN + timedelta(weeks=week)
+        digest = _enter_unchecked(ledger, calibration, at)
+        write(ledger, drives_of("demo"), sha256(str(week).encode()), digest=digest, at=at)
+        digests.append(digest)
+    _enter_unchecked(ledger, _made(ledger.cell, 5), BEGIN + timedelta(weeks=5))
+    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
+    report = json.loads(capsys.readouterr().out)
+    assert report["calibrations"] == 3
+    by_axes, by_unit = report["not_compared"]
+    assert digests[0][:12] in by_axes
+    assert "found gains of J1, J2, J3, J4; expected of J1, J2, J3, J4, J5, J6, as in" in by_axes
+    assert digests[1][:12] in by_unit
+    assert "found J1 in Nm/mA; expected J1 in" in by_unit
+    assert "2 calibrations left out of tables, drift and alarms" in caplog.text
+    assert by_axes in caplog.text
+    assert verify_ledger(ledger).unknown == ()
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
 
 
 def test_the_verb_says_in_what_another_robot_differs(
