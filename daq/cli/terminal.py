@@ -42,6 +42,11 @@ comes later.
 """
 
 
+CHANGED: list[str] = []
+"""Changes that this command has made to files that others fill, too, such as the audit log: a
+clause each, for the message of an error or interrupt that comes later.
+"""
+
 STARTED: list[Path] = []
 """Folders that this command was filling when it was interrupted."""
 

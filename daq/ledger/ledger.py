@@ -445,7 +445,7 @@ def _require_own_robot(ledger: Ledger, history: History) -> None:
             found=found,
             expected=expected,
             remedy="two robots have no common history: give the earlier name of this robot; "
-            "nothing was entered",
+            "nothing was renamed",
         )
 
 
@@ -629,7 +629,7 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     """Refuse a calibration that cannot be compared with those of the history."""
     remedy = (
         "gains are compared over time only where they mean the same: begin another audit log "
-        "(`history.audit` of the cell file); nothing was entered"
+        "(`history.audit` of the cell file); it was not entered"
     )
     units = {gain.axis: gain.unit for gain in calibration.gains}
     known: dict[str, str] = {}
@@ -643,13 +643,13 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     elif robot is not None:
         found = robot.found
         expected = robot.expected
-        remedy = "give the cell file of the robot that was calibrated; nothing was entered"
+        remedy = "give the cell file of the robot that was calibrated; it was not entered"
     elif history.renamed is not None:
         found = (
             f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
         )
         expected = f"{history.renamed.new!r}, its name since"
-        remedy = f"{history.renamed.remedy}; nothing was entered"
+        remedy = f"{history.renamed.remedy}; it was not entered"
     elif history.other_robots:
         found = str(history.other_robots[0])
         expected = "calibrations of one robot in a history"

@@ -5,6 +5,7 @@ and a renamed cell keeps its history.
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -22,6 +23,7 @@ from daq.errors import DataError, ExitCode
 from daq.files import sha256
 from daq.jobs.position import sessions_folder
 from daq.jobs.session import Basis, begin, rename_sessions, sessions
+from daq.ledger import ledger as ledger_module
 from daq.ledger.audit import AuditAction, append, read, verify
 from daq.ledger.fold import figures_of
 from daq.ledger.ledger import (
@@ -393,6 +395,74 @@ def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
     _enter(elsewhere, twin, 12)
     assert len(read_history(elsewhere).entries) == 1
     assert read_history(elsewhere).renamed is None
+
+
+def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
+    cell_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    text = text.replace("name: press", "name: press\nhistory: {audit: cell.audit.jsonl}", 1)
+    press = cell_file.with_name("press.yaml")
+    cell_file.rename(press)
+    press.write_text(text, encoding="utf-8")
+    left_behind = sessions_folder(cell_file)
+    elsewhere = tmp_path / "elsewhere"
+    _sessions_of(elsewhere, "demo", 1)
+    # Beside its own cell file, which is still there, a session is of that one.
+    others = tmp_path / "other.sessions"
+    _sessions_of(others, "demo", 1)
+    others.with_suffix(".yaml").touch()
+    absent = ["--rename", "demo", "--sessions", str(tmp_path / "absent")]
+    assert main(["history", str(press), *absent]) == ExitCode.USAGE
+    options = ["--rename", "demo", "--sessions", str(elsewhere)]
+    assert main(["history", str(press), *options]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert "2 sessions. Nothing was renamed; --yes does it." in said
+    assert main(["history", str(press), *options, "--yes"]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"1 session in {left_behind}, where `drivegain calibrate` looks with --sessions" in said
+    assert len(sessions(left_behind, "press")) == 1
+    assert len(sessions(elsewhere, "press")) == 1
+    assert len(sessions(others, "demo")) == 1
+
+
+@pytest.mark.parametrize("verb", ["--add", "--rename", "--acknowledge"])
+def test_an_interrupt_after_an_entry_says_what_was_entered(
+    cell_file: Path,
+    verb: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    name = "demo"
+    if verb == "--rename":
+        name = "press"
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", f"name: {name}", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    arguments, entering, expected = {
+        "--add": ([str(added)], "enter_calibration", f"{added} was entered into"),
+        "--rename": (["demo", "--yes"], "rename_cell", "has the rename of 'demo' to 'press'"),
+        "--acknowledge": (
+            ["J1", "--why", "new gearbox"],
+            "acknowledge",
+            "the change of J1 was entered as explained into",
+        ),
+    }[verb]
+    enter = getattr(ledger_module, entering)
+
+    def enter_and_interrupt(*values: object, **options: object) -> object:
+        result = enter(*values, **options)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(ledger_module, entering, enter_and_interrupt)
+    before = len(read(cell_file.with_name("cell.audit.jsonl")))
+    assert main(["history", str(cell_file), verb, *arguments]) == ExitCode.INTERRUPTED
+    assert len(read(cell_file.with_name("cell.audit.jsonl"))) == before + 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert expected in said
+    assert "no file was written" not in said
 
 
 def _enter_unchecked(ledger: Ledger, calibration: Calibration, at: datetime) -> str:
