@@ -321,7 +321,7 @@ def build_app() -> typer.Typer:
         "calibration refused, "
         "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate "
         "(11: the interlock refuses, 12: the bus is taken), "
-        "130 interrupted.",
+        "15 new moves contradict the gains that were written, see calibrate; 130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},
         pretty_exceptions_enable=False,

@@ -73,7 +73,9 @@ def history_verb(
     ] = None,
     by: Annotated[
         str | None,
-        typer.Option("--by", help="With --acknowledge: who explains it; you by default."),
+        typer.Option(
+            "--by", help="With --acknowledge, --add or --rename: who does it; you by default."
+        ),
     ] = None,
     why: Annotated[
         str | None, typer.Option("--why", help="With --acknowledge: what happened.")
@@ -142,12 +144,14 @@ def history_verb(
             remedy="give the cell file, not a log",
         )
     _check_files(plot, csv)
+    _check_companions("--acknowledge AXIS", acknowledge, {"--why": why, "--since": since})
+    has_entry = not (acknowledge is None and add is None and rename is None)
     _check_companions(
-        "--acknowledge AXIS", acknowledge, {"--by": by, "--why": why, "--since": since}
+        "--acknowledge, --add or --rename", "given" if has_entry else None, {"--by": by}
     )
     _check_companions("--rename OLD", rename, {"--yes": yes or None, "--sessions": sessions})
     now = datetime.now(UTC)
-    who = str(applier(by if acknowledge is not None else None))
+    who = str(applier(by))
     _migrate(ledger, who, now, forced=migrate)
     if rename is not None:
         _rename(ledger, cell, rename, sessions, who, now, confirmed=yes)
@@ -193,7 +197,7 @@ def _check_companions(
     if given is None and lonely:
         raise UsageError(
             ", ".join(lonely),
-            found=f"no {option.split(maxsplit=1)[0]}",
+            found=f"no {option.split(maxsplit=1)[0]}".rstrip(","),
             expected=f"it with {option}",
             remedy=f"give {option}, too",
         )

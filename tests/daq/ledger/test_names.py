@@ -426,6 +426,22 @@ def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
     assert len(sessions(others, "demo")) == 1
 
 
+def test_who_adds_or_renames_is_recorded(cell_file: Path) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    audit = cell_file.with_name("cell.audit.jsonl")
+    assert main(["history", str(cell_file), "--add", str(added), "--by", "Ada"]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.CALIBRATION_ENTERED
+    assert read(audit)[-1].who.startswith("Ada")
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    rename = ["--rename", "demo", "--yes", "--by", "Bert"]
+    assert main(["history", str(cell_file), *rename]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.RENAMED
+    assert read(audit)[-1].who.startswith("Bert")
+    assert main(["history", str(cell_file), "--by", "Cleo"]) == ExitCode.USAGE
+
+
 @pytest.mark.parametrize("verb", ["--add", "--rename", "--acknowledge"])
 def test_an_interrupt_after_an_entry_says_what_was_entered(
     cell_file: Path,
