@@ -92,19 +92,20 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}s"
 
 
-def first_few(texts: Sequence[str], count: int, note: str = "") -> str:
+def first_few(texts: Sequence[str], count: int, *, separator: str = "; ", note: str = "") -> str:
     """Join the first of some texts, and say how many more there are: ``a; b; and 3 more``.
 
     Args:
         texts: all of them.
         count: of those that are shown.
+        separator: between two texts, and before the number of the others.
         note: after the number of the others, such as where all are.
     """
-    shown = "; ".join(texts[:count])
+    parts = list(texts[:count])
     more = len(texts) - count
-    if more <= 0:
-        return shown
-    return f"{shown}; and {more} more{note}"
+    if more > 0:
+        parts.append(f"and {more} more{note}")
+    return separator.join(parts)
 
 
 def evidence(error: Exception) -> str:

@@ -293,9 +293,8 @@ def _require(ledger: Ledger, checked: Verification) -> None:
 
 
 def _first(sentences: Sequence[str]) -> str:
-    more = len(sentences) - _SHOWN
-    shown = "; ".join(map(printable, sentences[:_SHOWN]))
-    return shown + (f"; and {more} more (--json has all)" if more > 0 else "")
+    texts = [printable(sentence) for sentence in sentences]
+    return first_few(texts, _SHOWN, note=" (--json has all)")
 
 
 def _check_files(plot: Path | None, csv: Path | None) -> None:
@@ -353,12 +352,12 @@ def _say_names(history: History, cell_file: Path) -> None:
     if more > 0:
         _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
     if history.not_compared:
-        texts = [printable(str(one)) for one in history.not_compared]
+        texts = [str(one) for one in history.not_compared]
         _LOG.warning(
             "%s left out of tables, drift and alarms, for other axes or units than the newest one: "
             "%s",
             counted(len(texts), "calibration"),
-            first_few(texts, _SHOWN, " (--json has all)"),
+            _first(texts),
         )
     if history.renamed is not None:
         _LOG.warning(

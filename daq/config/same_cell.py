@@ -1,4 +1,4 @@
-"""Whether a log, a calibration and a description are of one cell,
+"""Whether a log, a plan or a calibration and a description are of one cell,
 and in what a corrected description differs.
 
 A description that replaces the one in a log corrects it: gravity, zero offsets, ratios, geometry,
@@ -18,7 +18,7 @@ from itertools import zip_longest
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
+from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch, first_few
 from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
@@ -253,25 +253,19 @@ def _differences_of_drives(
     return differences
 
 
+_SHOWN = 3  #: Differences in a message
+
+
 def found_text(differences: Sequence[RobotDifference]) -> str:
     """Join what was found of each difference;
     of many, the first ones and the number of the others.
     """
-    return _first_of([difference.found for difference in differences])
+    return first_few([difference.found for difference in differences], _SHOWN)
 
 
 def expected_text(differences: Sequence[RobotDifference]) -> str:
     """Join what was expected of each difference, as `found_text`."""
-    return _first_of([difference.expected for difference in differences])
-
-
-_SHOWN = 3  #: Differences in a message
-
-
-def _first_of(texts: Sequence[str]) -> str:
-    more = len(texts) - _SHOWN
-    shown = "; ".join(texts[:_SHOWN])
-    return f"{shown}; and {more} more" if more > 0 else shown
+    return first_few([difference.expected for difference in differences], _SHOWN)
 
 
 def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:

@@ -25,6 +25,7 @@ from daq.errors import (
     HistoryUnreadable,
     OutputFailed,
     evidence,
+    first_few,
     reason_of,
     writing,
 )
@@ -558,11 +559,9 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
 
 def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
     """Return the error for a history of an earlier version that is broken."""
-    listed = list(flaws)
-    more = len(listed) - _SHOWN
     return HistoryUnreadable(
         str(ledger.stored),
-        found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
+        found=first_few(tuple(flaws), _SHOWN),
         expected="a sound SQLite file whose calibrations can be read",
         remedy="ask who can write to it, and restore the last good one from a backup, or go on "
         "without it: "
