@@ -24,7 +24,7 @@ drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
@@ -90,6 +90,22 @@ def counted(count: int, noun: str) -> str:
     if noun.endswith("y"):
         return f"{count} {noun[:-1]}ies"
     return f"{count} {noun}s"
+
+
+def first_few(texts: Sequence[str], count: int, *, separator: str = "; ", note: str = "") -> str:
+    """Join the first of some texts, and say how many more there are: ``a; b; and 3 more``.
+
+    Args:
+        texts: all of them.
+        count: of those that are shown.
+        separator: between two texts, and before the number of the others.
+        note: after the number of the others, such as where all are.
+    """
+    parts = list(texts[:count])
+    more = len(texts) - count
+    if more > 0:
+        parts.append(f"and {more} more{note}")
+    return separator.join(parts)
 
 
 def evidence(error: Exception) -> str:

@@ -20,7 +20,14 @@ from typer.core import TyperGroup
 
 from daq.cli.failure import ErrorParts, show_failure
 from daq.cli.output import QueuedOutput
-from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
+from daq.cli.terminal import (
+    CHANGED,
+    STARTED,
+    WRITTEN,
+    interruptible,
+    remove_empty_folders,
+    say_last,
+)
 from daq.cli.verb import HELP_NAMES, Job, Verb
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
@@ -311,7 +318,8 @@ def build_app() -> typer.Typer:
         "calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 "
         "calibration refused, 4 data unfit, 5 device fault, 6 configuration, 10 to 14 see "
-        "recalibrate (11: the interlock refuses, 12: the bus is taken), 130 interrupted.",
+        "recalibrate (11: the interlock refuses, 12: the bus is taken), 15 new moves contradict "
+        "the gains that were written, see calibrate; 130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},
         pretty_exceptions_enable=False,
@@ -332,6 +340,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
+    CHANGED.clear()
     STARTED.clear()
     words = sys.argv[1:] if arguments is None else list(arguments)
     json_wanted = "--json" in words[: words.index("--") if "--" in words else None]
@@ -387,7 +396,8 @@ def _run(words: list[str], json_wanted: bool) -> int:
             words, prog_name="drivegain", standalone_mode=False
         )
     except (DaqError, DriverError, IdentificationError) as error:
-        if isinstance(error, OutputFailed) and _kept():
+        is_told = isinstance(error, OutputFailed) or bool(CHANGED)
+        if is_told and _kept():
             error.add_note(f"kept: {_kept()}")
         failure = ErrorParts.of(error, _verb_of(words))
         show_failure(failure, json_wanted=json_wanted)
@@ -400,7 +410,9 @@ def _run(words: list[str], json_wanted: bool) -> int:
             return _output_failed(stop.__context__, json_wanted)
         ended = stop.code
     except typer.Abort:
-        say_last("interrupted: no file was written")  # Ctrl-C or Ctrl-D at a prompt
+        # Ctrl-C or Ctrl-D at a prompt
+        said = _kept() or "no file was written"
+        say_last(printable(f"interrupted: {said}"))
         ended = ExitCode.INTERRUPTED
     except CLICK_ERROR as error:
         ended = _usage_failed(error, words, json_wanted)
@@ -447,11 +459,12 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
 
 def _output_failed(error: OSError, json_wanted: bool) -> int:
     # A reader that closed the pipe needs no message where nothing was written; a full disk does.
-    if WRITTEN or not isinstance(error, BrokenPipeError):
+    has_changed = bool(WRITTEN or CHANGED)
+    if has_changed or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
         if not error.filename:
             failed.expected = "an output that takes what is printed"
-            if WRITTEN:
+            if has_changed:
                 failed.remedy = f"only the printed output is lost: {_kept()}"
             else:
                 failed.remedy = "send it elsewhere"
@@ -460,8 +473,8 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
 
 
 def _kept() -> str:
-    """Say what this command has written: files that are complete,
-    and folders that it was still filling.
+    """Say what this command has written: files that are complete, folders that it was still
+    filling, and changes of other files.
     """
     unfinished = [str(path) for path in STARTED if path.exists()]
     if WRITTEN:
@@ -470,8 +483,7 @@ def _kept() -> str:
         parts = []
     if unfinished:
         parts += [f"{', '.join(unfinished)} has what was finished until then"]
-    else:
-        parts += []
+    parts += CHANGED
     return "; ".join(parts)
 
 

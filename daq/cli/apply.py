@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from daq.cli.output import wait_until_shown
+from daq.cli.output import has_reader, wait_until_shown
 from daq.cli.terminal import (
     WRITTEN,
     at_most_one,
@@ -37,6 +37,7 @@ from daq.errors import (
     CalibrationRefused,
     ConfigurationInconsistent,
     ExitCode,
+    OutputFailed,
     UsageError,
 )
 from daq.report.text import terminal_text
@@ -206,7 +207,7 @@ def apply_to(
             show_proposal(proposal, output_console(), known)
         try:
             if yes:
-                wait_until_shown(sys.stdout)  # what cannot be shown is not written
+                _require_shown(json=json)
                 with (
                     whole or nullcontext(),
                     write_output(edit.place) if edit.has_effect else nullcontext(),
@@ -222,6 +223,28 @@ def apply_to(
         _show_outcome(proposal, written, audit, undo, yes=yes)
     if proposal.refusals:
         raise proposal.error
+
+
+def _require_shown(*, json: bool) -> None:
+    """Refuse to write what cannot be shown.
+
+    What a write changes is printed before it, and with --json after it, to a reader that may have
+    gone.
+
+    Raises:
+        OSError: what was printed cannot be written.
+        OutputFailed: the reader of standard output has gone.
+    """
+    if not json:
+        wait_until_shown(sys.stdout)
+    elif not has_reader(sys.stdout):
+        raise OutputFailed(
+            "standard output",
+            found="a pipe or terminal whose other end is closed",
+            expected="a reader of the report that follows the write",
+            remedy="nothing was written; repeat the command with a reader, or send its output to "
+            "a file",
+        )
 
 
 def _show_outcome(
@@ -421,7 +444,7 @@ def rollback_drives(
         if not json:
             show_drive_rollback(planned, console)
         if yes:
-            wait_until_shown(sys.stdout)  # what cannot be shown is not written
+            _require_shown(json=json)
             with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
     if json:

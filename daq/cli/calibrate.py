@@ -159,10 +159,10 @@ class Person:
             them = "it"
         else:
             them = f"these {len(blocks)} blocks"
-        return (
-            ask(f"Press Enter to record {them} again, or type {KEEP} to keep {run.name} as it is")
-            != KEEP
+        is_kept = ask_word(
+            f"Press Enter to record {them} again, or type {KEEP} to keep {run.name} as it is", KEEP
         )
+        return not is_kept
 
     def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""
@@ -171,7 +171,7 @@ class Person:
         show_proposal(proposal, output_console())
         if touched:
             tell("! The controller's file was written or rolled back since the session began.")
-        return ask(f"Type {YES} to write to {proposal.edit.subject}, else Enter") == YES
+        return ask_word(f"Type {YES} to write to {proposal.edit.subject}, else Enter", YES)
 
 
 def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
@@ -193,6 +193,24 @@ def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
 def tell(text: str, *, bold: bool = False) -> None:
     """Print a line for the operator."""
     typer.secho(printable(text), err=True, bold=bold)
+
+
+def ask_word(question: str, word: str) -> bool:
+    """Ask the operator for one word; return whether it was typed, in letters of either case.
+
+    Enter alone, or `no`, means that it was not. Any other answer may be the word with a slip, so
+    the question is asked again.
+
+    Raises:
+        JobHeld: the input has ended.
+    """
+    while True:
+        answer = ask(question)
+        if answer.casefold() == word:
+            return True
+        if answer.casefold() in {"", "no"}:
+            return False
+        tell(f"Found {answer!r}, expected {word}, or Enter alone.")
 
 
 def ask(question: str) -> str:

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, output_console, say, say_written, write_file
+from daq.cli.terminal import (
+    CHANGED,
+    check_replaceable,
+    delay_signals,
+    output_console,
+    say,
+    say_written,
+    write_file,
+)
 from daq.cli.verb import JsonOption, output_option, print_json, read_cell
 from daq.errors import (
     AuditUnusable,
@@ -26,6 +34,7 @@ from daq.errors import (
     UsageError,
     counted,
     evidence,
+    first_few,
 )
 from daq.files import sha256
 from daq.report.text import printable
@@ -64,7 +73,9 @@ def history_verb(
     ] = None,
     by: Annotated[
         str | None,
-        typer.Option("--by", help="With --acknowledge: who explains it; you by default."),
+        typer.Option(
+            "--by", help="With --acknowledge, --add or --rename: who does it; you by default."
+        ),
     ] = None,
     why: Annotated[
         str | None, typer.Option("--why", help="With --acknowledge: what happened.")
@@ -97,6 +108,12 @@ def history_verb(
     yes: Annotated[
         bool, typer.Option("--yes", help="With --rename: do it; without it, it is only shown.")
     ] = False,
+    sessions: Annotated[
+        Path | None,
+        typer.Option(
+            "--sessions", help="With --rename: folder of sessions, where `calibrate` got one."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ,
@@ -127,15 +144,17 @@ def history_verb(
             remedy="give the cell file, not a log",
         )
     _check_files(plot, csv)
+    _check_companions("--acknowledge AXIS", acknowledge, {"--why": why, "--since": since})
+    has_entry = not (acknowledge is None and add is None and rename is None)
     _check_companions(
-        "--acknowledge AXIS", acknowledge, {"--by": by, "--why": why, "--since": since}
+        "--acknowledge, --add or --rename", "given" if has_entry else None, {"--by": by}
     )
-    _check_companions("--rename OLD", rename, {"--yes": yes or None})
+    _check_companions("--rename OLD", rename, {"--yes": yes or None, "--sessions": sessions})
     now = datetime.now(UTC)
-    who = str(applier(by if acknowledge is not None else None))
+    who = str(applier(by))
     _migrate(ledger, who, now, forced=migrate)
     if rename is not None:
-        _rename(ledger, cell, rename, who, now, confirmed=yes)
+        _rename(ledger, cell, rename, sessions, who, now, confirmed=yes)
     if add is not None:
         _add(ledger, add, who, now)
     checked, history, all_series = _read(ledger, verify)
@@ -178,7 +197,7 @@ def _check_companions(
     if given is None and lonely:
         raise UsageError(
             ", ".join(lonely),
-            found=f"no {option.split(maxsplit=1)[0]}",
+            found=f"no {option.split(maxsplit=1)[0]}".rstrip(","),
             expected=f"it with {option}",
             remedy=f"give {option}, too",
         )
@@ -271,9 +290,8 @@ def _require(ledger: Ledger, checked: Verification) -> None:
 
 
 def _first(sentences: Sequence[str]) -> str:
-    more = len(sentences) - _SHOWN
-    shown = "; ".join(map(printable, sentences[:_SHOWN]))
-    return shown + (f"; and {more} more (--json has all)" if more > 0 else "")
+    texts = [printable(sentence) for sentence in sentences]
+    return first_few(texts, _SHOWN, note=" (--json has all)")
 
 
 def _check_files(plot: Path | None, csv: Path | None) -> None:
@@ -299,7 +317,10 @@ def _migrate(ledger: Ledger, who: str, now: datetime, *, forced: bool) -> None:
     if not forced and not ledger.outdated:
         return
     try:
-        done = migrate(ledger, who=who, at=now, forced=forced)
+        with delay_signals():
+            done = migrate(ledger, who=who, at=now, forced=forced)
+            if done.entries or done.aside is not None:
+                CHANGED.append(f"the history of an earlier version was migrated to {ledger.audit}")
     except DaqError as error:
         if forced:
             raise
@@ -327,13 +348,21 @@ def _say_names(history: History, cell_file: Path) -> None:
     more = len(history.other_robots) - _SHOWN
     if more > 0:
         _LOG.warning("and %s of another robot (--json has all)", counted(more, "more calibration"))
+    if history.not_compared:
+        texts = [str(one) for one in history.not_compared]
+        _LOG.warning(
+            "%s left out of tables, drift and alarms, for other axes or units than the newest one: "
+            "%s",
+            counted(len(texts), "calibration"),
+            _first(texts),
+        )
     if history.renamed is not None:
         _LOG.warning(
-            "this cell was renamed: found the name %r, expected %r, since %s; give the cell file "
-            "with that name",
+            "this cell was renamed: found the name %r, expected %r, since %s; %s",
             history.renamed.old,
             history.renamed.new,
             history.renamed.at,
+            history.renamed.remedy,
         )
     for name in history.possible_names:
         command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"
@@ -346,12 +375,22 @@ def _say_names(history: History, cell_file: Path) -> None:
 
 
 def _rename(
-    ledger: Ledger, cell_file: Path, old: str, who: str, now: datetime, *, confirmed: bool
+    ledger: Ledger,
+    cell_file: Path,
+    old: str,
+    named_folder: Path | None,
+    who: str,
+    now: datetime,
+    *,
+    confirmed: bool,
 ) -> None:
     """Take the history and the sessions of a cell's earlier name over;
     without `confirmed`, say what that would be.
+
+    Sessions are looked for in the scheduled job's folder, in that of the cell file, in those that
+    cell files of other names have left beside it, and in the one that was named.
     """
-    from daq.jobs.position import sessions_folder
+    from daq.jobs.position import former_session_folders, sessions_folder
     from daq.jobs.session import rename_sessions, sessions_to_rename
     from daq.jobs.units import unit_name
     from daq.ledger.ledger import plan_rename, rename_cell
@@ -366,13 +405,25 @@ def _rename(
             remedy="write the new name into the cell file (`name:`) first, then give the "
             "old one here",
         )
-    folders = {sessions_folder(cell_file)}
+    if named_folder is not None and not named_folder.is_dir():
+        raise UsageError(
+            "--sessions",
+            found=f"{named_folder}, which is no folder",
+            expected="the folder that `drivegain calibrate` got with --sessions",
+            remedy="correct its name; nothing was renamed",
+        )
+    own_folder = sessions_folder(cell_file)
+    guided = {own_folder, *former_session_folders(cell_file)}
+    if named_folder is not None:
+        guided.add(named_folder)
+    folders = set(guided)
     if cell.recalibration is not None:
         folders.add(cell.recalibration.folder)
     with bus_lock(cell):  # a job that runs would write its state under the old name again
         planned = plan_rename(ledger, old)
         until = planned.entered_at or now
-        count = sum(len(sessions_to_rename(folder, old, until)) for folder in folders)
+        found = {folder: len(sessions_to_rename(folder, old, until)) for folder in folders}
+        count = sum(found.values())
         taken = ", ".join(
             (
                 counted(planned.calibrations, "calibration"),
@@ -390,13 +441,19 @@ def _rename(
             )
         if not confirmed:
             say(
-                f"Would rename {old!r} to {cell.name!r}: {taken}. Nothing was changed; "
+                f"Would rename {old!r} to {cell.name!r}: {taken}. Nothing was renamed; "
                 "--yes does it.",
                 err=True,
             )
             return
-        rename_cell(ledger, planned, who=who, at=now)
-        rename_sessions(folders, old, cell.name, until)
+        with delay_signals():
+            rename_cell(ledger, planned, who=who, at=now)
+            if planned.entered_at is None:
+                CHANGED.append(
+                    f"{ledger.audit} has the rename of {old!r} to {cell.name!r}; the same command "
+                    "renames the sessions that still have the old name"
+                )
+            rename_sessions(folders, old, cell.name, until)
     if planned.entered_at is None:
         say(f"Renamed {old!r} to {cell.name!r}: {taken}.", err=True)
     else:
@@ -405,6 +462,13 @@ def _rename(
             f"{counted(count, 'session')} taken over now.",
             err=True,
         )
+    for folder in sorted(guided - {own_folder}):
+        if found[folder]:
+            say(
+                f"{counted(found[folder], 'session')} in {folder}, where `drivegain calibrate` "
+                f"looks with --sessions alone: without it, it looks in {own_folder}.",
+                err=True,
+            )
     say(
         "Logs, plans and calibration files keep the old name: make new ones. A schedule of the old "
         f"name ({unit_name(replace(cell, name=old))}.timer) has to be disabled, and made again: "
@@ -426,7 +490,9 @@ def _acknowledge(
     # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may
     # be ahead of ours.
     begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
-    acknowledge(ledger, series.axis, since=begins, at=now, who=who, why=why)
+    with delay_signals():
+        acknowledge(ledger, series.axis, since=begins, at=now, who=who, why=why)
+        CHANGED.append(f"the change of {series.axis} was entered as explained into {ledger.audit}")
 
 
 def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
@@ -440,10 +506,13 @@ def _add(ledger: Ledger, file: Path, who: str, now: datetime) -> None:
             str(file),
             found=f"a calibration of cell {calibration.cell!r}",
             expected=f"one of {ledger.cell.name!r}",
-            remedy="give the file of the cell that it belongs to; nothing was entered",
+            remedy="give the file of the cell that it belongs to; it was not entered",
         )
     before = verify_ledger(ledger).unknown
-    new = enter_calibration(ledger, calibration, digest=sha256(content), who=who, at=now)
+    with delay_signals():  # an interrupt says what was entered
+        new = enter_calibration(ledger, calibration, digest=sha256(content), who=who, at=now)
+        if new:
+            CHANGED.append(f"{file} was entered into {ledger.audit}")
     say(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
     checked = verify_ledger(ledger, _session_heads(ledger.cell))

@@ -86,7 +86,8 @@ def export_urdf_verb(
         same = _is_same(known, declared)
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
-        model, limits, same = *_plain(content.decode("utf-8")), None
+        model, limits = _plain(content.decode("utf-8"))
+        same = None
     require_packages(
         "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
     )
@@ -282,19 +283,15 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
     from ident.model.bodies import body_of
 
     parameters = robot.parameters
-    values = dict(
-        zip((column.name for column in parameters.model.columns), parameters.standard, strict=True)
-    )
-    return {
-        joint.name: JointUpdate(
-            body_of(link),
-            max(0.0, float(values[f"fv{number}"])),
-            max(0.0, float(values[f"fs{number}"])),
-        )
-        for number, (joint, link) in enumerate(
-            zip(parameters.model.robot.joints, parameters.links, strict=True), start=1
-        )
-    }
+    names = [column.name for column in parameters.model.columns]
+    values = dict(zip(names, parameters.standard, strict=True))
+    joints_and_links = zip(parameters.model.robot.joints, parameters.links, strict=True)
+    updates = {}
+    for number, (joint, link) in enumerate(joints_and_links, start=1):
+        viscous = float(values[f"fv{number}"])
+        coulomb = float(values[f"fs{number}"])
+        updates[joint.name] = JointUpdate(body_of(link), max(0.0, viscous), max(0.0, coulomb))
+    return updates
 
 
 def _is_same(calibration: Calibration, cell: Cell) -> bool | None:
@@ -344,9 +341,10 @@ def _plain(urdf: str) -> tuple[Model, FloatArray]:
 
     robot = robot_from_urdf(urdf)
     count = robot.joint_count
-    return Model(robot, DriveTrain(np.eye(count))), np.repeat(
-        np.array([[0.0], [np.pi], [3.0], [10.0]]), count, axis=1
-    )
+    model = Model(robot, DriveTrain(np.eye(count)))
+    limits_of_a_joint = np.array([[0.0], [np.pi], [3.0], [10.0]])
+    limits = np.repeat(limits_of_a_joint, count, axis=1)
+    return model, limits
 
 
 def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
@@ -356,9 +354,8 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
     from ident.physical.physical import urdf_links
 
     def check(content: bytes) -> None:
-        if not np.allclose(
-            urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12
-        ):
+        links = urdf_links(content.decode("utf-8"))
+        if not np.allclose(links, robot.parameters.links, rtol=1e-9, atol=1e-12):
             raise OutputFailed(
                 str(out),
                 found="other inertias on reading back",

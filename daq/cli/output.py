@@ -132,6 +132,14 @@ class OutputWriter:
         return self._waiting_bytes > PROGRESS_BYTES
 
     @property
+    def has_reader(self) -> bool:
+        """Whether the other end of a pipe, a socket or a terminal is open; true of a file."""
+        poll = select.poll()
+        poll.register(self._descriptor, 0)
+        closed = select.POLLERR | select.POLLHUP
+        return not any(events & closed for _, events in poll.poll(0))
+
+    @property
     def _is_empty(self) -> bool:
         return self._waiting_bytes == 0 and self._lost_lines == 0
 
@@ -344,6 +352,15 @@ def wait_until_shown(*streams: object) -> None:
         writer = writer_of(stream)
         if writer is not None:
             writer.wait()
+
+
+def has_reader(stream: object) -> bool:
+    """Whether a stream that is written by a writer still has one that may read it.
+
+    Of a file, of a stream in memory and of a closed one it is true.
+    """
+    writer = writer_of(stream)
+    return writer is None or writer.has_reader
 
 
 def release_results() -> None:

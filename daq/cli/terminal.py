@@ -24,7 +24,7 @@ from rich.text import Text
 
 from daq.cli.output import release_results
 from daq.cli.verb import judged_output
-from daq.errors import OutputFailed, UsageError, writing
+from daq.errors import OutputFailed, UsageError, first_few, writing
 from daq.files import is_taken, replace_file
 from daq.report.text import break_lines, terminal_text
 
@@ -41,6 +41,11 @@ WRITTEN: list[Path] = []
 comes later.
 """
 
+
+CHANGED: list[str] = []
+"""Changes that this command has made to files that others fill, too, such as the audit log: a
+clause each, for the message of an error or interrupt that comes later.
+"""
 
 STARTED: list[Path] = []
 """Folders that this command was filling when it was interrupted."""
@@ -117,10 +122,9 @@ def replace_output(path: Path) -> Iterator[None]:
         return
     oldest_ns = min(before[file].modified_ns for file in replaced)
     since = datetime.fromtimestamp(oldest_ns / 1e9, UTC)
-    names = [str(file) for file in replaced[:NAMED_FILES]]
-    if len(replaced) > NAMED_FILES:
-        names.append(f"{len(replaced) - NAMED_FILES} more")
-    replaced_text = terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)")
+    names = [str(file) for file in replaced]
+    named = first_few(names, NAMED_FILES, separator=", ")
+    replaced_text = terminal_text(f"Replaced: {named} (of {since:%Y-%m-%d %H:%M} UTC)")
     say(replaced_text.plain, err=True)
 
 

@@ -1,4 +1,4 @@
-"""Whether a log, a calibration and a description are of one cell,
+"""Whether a log, a plan or a calibration and a description are of one cell,
 and in what a corrected description differs.
 
 A description that replaces the one in a log corrects it: gravity, zero offsets, ratios, geometry,
@@ -18,7 +18,7 @@ from itertools import zip_longest
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
+from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch, first_few
 from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
@@ -95,21 +95,21 @@ def mismatch(own: Cell, given: Cell) -> Mismatch | None:
     found = _mismatch_of_axes(own.name, own.axis_names, given)
     if found is not None:
         return found
-    joints = _joints(own)
-    expected = _joints(given)
-    if joints != expected:
-        return Mismatch(
-            f"joints {', '.join(joints)}", f"{', '.join(expected)}, as in the given description"
-        )
+    differences = robot_differences(calibrated_robot(own), calibrated_robot(given))
+    if differences:
+        if _has_exchanged_nodes(own, given):
+            remedy = _RECORD_AGAIN
+        else:
+            remedy = _REMEDY
+        expected = f"{expected_text(differences)}, as in the given description"
+        return Mismatch(found_text(differences), expected, remedy)
+    # A log was recorded with these very drives, so it alone is compared by serial numbers, too.
     for one, other in zip(own.axes, given.axes, strict=True):
-        for label, recorded, wanted in _drive_of(one, other):
-            if recorded is not None and wanted is not None and recorded != wanted:
-                found_text = f"{label} {recorded} of axis {one.name}"
-                if _has_exchanged_nodes(own, given):
-                    remedy = _RECORD_AGAIN
-                else:
-                    remedy = _REMEDY
-                return Mismatch(found_text, f"{wanted}, as in the given description", remedy)
+        recorded = _serial(one)
+        wanted = _serial(other)
+        if recorded is not None and wanted is not None and recorded != wanted:
+            found_serial = f"serial number {recorded} of axis {one.name}"
+            return Mismatch(found_serial, f"{wanted}, as in the given description")
     return None
 
 
@@ -120,71 +120,33 @@ def _has_exchanged_nodes(own: Cell, given: Cell) -> bool:
     return first != second and set(first) == set(second)
 
 
-@dataclass(frozen=True, slots=True)
-class RobotIdentity:
-    """What tells a robot from another of the same name and axes,
-    for a file that is made for one of them.
+def calibrated_robot(cell: Cell) -> CalibratedRobot:
+    """Return a cell's robot as its plans, its calibrations and its history name it.
 
     What a description corrects (zero offsets, gravity, lengths, masses, nameplate gains) is no part
     of it, nor is a serial number: a drive that is exchanged does not make a robot another one.
     """
-
-    #: of joints, their kinds and order, and the motors of a closed chain, hex
-    kinematics_sha256: str
-    drives_sha256: str  #: of node id, vendor and product code of each axis, hex
-
-    def differences(self, expected: RobotIdentity) -> tuple[str, ...]:
-        """Name the parts that differ: none for the same robot."""
-        parts = []
-        if self.kinematics_sha256 != expected.kinematics_sha256:
-            parts.append("joints (names, kinds, parents or motors)")
-        if self.drives_sha256 != expected.drives_sha256:
-            parts.append("drives (node ids, vendors or product codes)")
-        return tuple(parts)
-
-
-def robot_identity(cell: Cell) -> RobotIdentity:
-    """Return the identity of a cell's robot."""
-    parents = [joint.parent for joint in read_urdf(cell.urdf).joints]
-    kinematics = [_joints(cell), parents]
-    drives = []
-    for axis in cell.axes:
-        identity = axis.identity
-        vendor_id = None if identity is None else identity.vendor_id
-        if identity is None:
-            product_code = None
-        else:
-            product_code = identity.product_code
-        drives.append([axis.name, axis.node_id, vendor_id, product_code])
-    return RobotIdentity(_sha256(kinematics), _sha256(drives))
-
-
-def calibrated_robot(cell: Cell) -> CalibratedRobot:
-    """Return a cell's robot as its calibrations and its history name it."""
-    identity = robot_identity(cell)
     described = read_urdf(cell.urdf).joints
     joints = []
     for joint in described:
-        if joint.parent < 0:
-            parent = ""
-        else:
-            parent = described[joint.parent].name
+        parent = "" if joint.parent < 0 else described[joint.parent].name
         joints.append(CalibratedJoint(joint.name, joint.kind.value, parent))
     drives = []
     for axis in cell.axes:
-        if axis.identity is None:
-            vendor_id = None
-        else:
-            vendor_id = axis.identity.vendor_id
-        if axis.identity is None:
-            product_code = None
-        else:
-            product_code = axis.identity.product_code
+        vendor_id = None if axis.identity is None else axis.identity.vendor_id
+        product_code = None if axis.identity is None else axis.identity.product_code
         drives.append(CalibratedDrive(axis.name, axis.node_id, vendor_id, product_code))
     motors = () if cell.chain is None else tuple(cell.chain.motors)
+    parents = [joint.parent for joint in described]
+    kinematics_sha256 = _sha256([_joints(cell), parents])
     return CalibratedRobot(
-        identity.kinematics_sha256, identity.drives_sha256, tuple(joints), tuple(drives), motors
+        kinematics_sha256, _drives_sha256(drives), tuple(joints), tuple(drives), motors
     )
+
+
+def _drives_sha256(drives: Sequence[CalibratedDrive]) -> str:
+    listed = [[drive.axis, drive.node_id, drive.vendor_id, drive.product_code] for drive in drives]
+    return _sha256(listed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,28 +162,60 @@ def robot_differences(
 ) -> tuple[RobotDifference, ...]:
     """Name the joints and drives in which two robots differ; none for the same robot.
 
-    A number of a drive that one of the two leaves open differs from none. A calibration of an
-    earlier version does not say its robot (None), so that nothing differs.
+    This is the one rule for logs, plans and calibrations: the same axes, the same joints (name,
+    kind, parent, motor) in the same order, and the same drives (node id, vendor, product). A number
+    of a drive that one of the two leaves open differs from none.
+
+    Args:
+        found: robot of a file; None for a file of an earlier version that does not say it, so that
+            nothing differs. A plan of an earlier version has the digests alone.
+        expected: robot that is compared with.
     """
     if found is None or expected is None:
         return ()
+    if not found.joints:
+        return _differences_of_digests(found, expected)
     differences = []
-    if found.kinematics_sha256 != expected.kinematics_sha256:
-        for one, other in zip_longest(
-            map(_joint_text, found.joints), map(_joint_text, expected.joints)
-        ):
-            if one != other:
-                differences.append(
-                    RobotDifference(one or "no further joint", other or "no further joint")
-                )
-        if found.motors != expected.motors:
+    found_joints = map(_joint_text, found.joints)
+    expected_joints = map(_joint_text, expected.joints)
+    for one, other in zip_longest(found_joints, expected_joints):
+        if one != other:
             differences.append(
-                RobotDifference(_motors_text(found.motors), _motors_text(expected.motors))
+                RobotDifference(one or "no further joint", other or "no further joint")
             )
+    if found.motors != expected.motors:
+        differences.append(
+            RobotDifference(_motors_text(found.motors), _motors_text(expected.motors))
+        )
     by_axis = {drive.axis: drive for drive in expected.drives}
+    axes = [drive.axis for drive in found.drives]
+    if axes != list(by_axis):
+        differences.append(RobotDifference(f"axes {', '.join(axes)}", f"axes {', '.join(by_axis)}"))
     for drive in found.drives:
         if drive.axis in by_axis:
             differences += _differences_of_drives(drive, by_axis[drive.axis])
+    return tuple(differences)
+
+
+def _differences_of_digests(
+    found: CalibratedRobot, expected: CalibratedRobot
+) -> tuple[RobotDifference, ...]:
+    """Compare the digests of a file that lists neither joints nor drives.
+
+    Numbers that its cell file left open then, on every axis, may be declared by now.
+    """
+    differences = []
+    if found.kinematics_sha256 != expected.kinematics_sha256:
+        text = "joints (names, kinds, parents or motors)"
+        differences.append(RobotDifference(f"other {text}", f"the same {text}"))
+    without_vendor = [replace(drive, vendor_id=None) for drive in expected.drives]
+    without_product = [replace(drive, product_code=None) for drive in expected.drives]
+    without_both = [replace(drive, product_code=None) for drive in without_vendor]
+    known = {_drives_sha256(drives) for drives in (without_vendor, without_product, without_both)}
+    known.add(expected.drives_sha256)
+    if found.drives_sha256 not in known:
+        text = "drives (node ids, vendors or product codes)"
+        differences.append(RobotDifference(f"other {text}", f"the same {text}"))
     return tuple(differences)
 
 
@@ -257,25 +251,19 @@ def _differences_of_drives(
     return differences
 
 
+_SHOWN = 3  #: Differences in a message
+
+
 def found_text(differences: Sequence[RobotDifference]) -> str:
     """Join what was found of each difference;
     of many, the first ones and the number of the others.
     """
-    return _first_of([difference.found for difference in differences])
+    return first_few([difference.found for difference in differences], _SHOWN)
 
 
 def expected_text(differences: Sequence[RobotDifference]) -> str:
     """Join what was expected of each difference, as `found_text`."""
-    return _first_of([difference.expected for difference in differences])
-
-
-_SHOWN = 3  #: Differences in a message
-
-
-def _first_of(texts: Sequence[str]) -> str:
-    more = len(texts) - _SHOWN
-    shown = "; ".join(texts[:_SHOWN])
-    return f"{shown}; and {more} more" if more > 0 else shown
+    return first_few([difference.expected for difference in differences], _SHOWN)
 
 
 def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:
@@ -386,23 +374,6 @@ def _joints(cell: Cell) -> tuple[str, ...]:
     if cell.chain is None:
         return joints
     return (*joints, f"with motors on {', '.join(cell.chain.motors)}")
-
-
-def _drive_of(own: CellAxis, given: CellAxis) -> tuple[tuple[str, int | None, int | None], ...]:
-    """Pairs of numbers that tell one drive from another;
-    a number that one of the two leaves open is None.
-    """
-    first = own.identity
-    second = given.identity
-    node = ("node id", own.node_id, given.node_id)
-    if first is None or second is None:
-        return (node,)
-    return (
-        node,
-        ("vendor id", first.vendor_id, second.vendor_id),
-        ("product code", first.product_code, second.product_code),
-        ("serial number", first.serial, second.serial),
-    )
 
 
 def _mismatch_of_axes(name: str, axes: tuple[str, ...], given: Cell) -> Mismatch | None:

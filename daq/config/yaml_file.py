@@ -26,7 +26,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, g
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
-from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid, reason_of
+from daq.errors import (
+    ConfigurationMissing,
+    DaqError,
+    SchemaMismatch,
+    YamlInvalid,
+    first_few,
+    reason_of,
+)
 from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
@@ -420,17 +427,12 @@ def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:
             "found": only.found,
             "expected": only.expected,
         }
-    shown = [
-        f"\n  {document.where(f.path)}: found {f.found}; expected {f.expected}"
-        for f in faults[:MAX_SHOWN]
-    ]
-    if len(faults) > MAX_SHOWN:
-        more = f"\n  and {len(faults) - MAX_SHOWN} more"
-    else:
-        more = ""
+    new_line = "\n  "
+    texts = [f"{document.where(f.path)}: found {f.found}; expected {f.expected}" for f in faults]
+    listed = first_few(texts, MAX_SHOWN, separator=new_line)
     return {
         "subject": document.name,
-        "found": f"{len(faults)} faults{''.join(shown)}{more}",
+        "found": f"{len(faults)} faults{new_line}{listed}",
         "expected": "none",
     }
 

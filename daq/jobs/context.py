@@ -480,8 +480,8 @@ def _require_own_history(context: SessionContext) -> None:
             f"cell {name!r}",
             found=f"a robot that was renamed to {history.renamed.new!r} at {history.renamed.at}",
             expected="a cell file with its present name",
-            remedy="nothing has moved; write the new name into the cell file, and make the "
-            "schedule again (`drivegain schedule`)",
+            remedy=f"nothing has moved; {history.renamed.remedy}; then make the schedule again "
+            "(`drivegain schedule`)",
         )
     if history.other_robots:
         raise JobHeld(

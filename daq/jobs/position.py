@@ -33,7 +33,25 @@ class Position:
 
 def sessions_folder(cell_file: Path) -> Path:
     """Return the folder of the guided sessions of a cell, where none was named."""
-    return cell_file.with_suffix(".sessions")
+    return cell_file.with_suffix(SESSIONS_SUFFIX)
+
+
+SESSIONS_SUFFIX = ".sessions"
+
+
+def former_session_folders(cell_file: Path) -> tuple[Path, ...]:
+    """Return the folders beside a cell file that have sessions of a cell file of another name.
+
+    A cell file that was renamed leaves its sessions behind, under its earlier name. Where there is
+    a cell file of that name, the sessions are its own.
+    """
+    found = []
+    for folder in sorted(cell_file.parent.glob(f"*{SESSIONS_SUFFIX}")):
+        owners = [folder.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+        is_owned = any(owner.exists() for owner in owners)
+        if folder.is_dir() and folder != sessions_folder(cell_file) and not is_owned:
+            found.append(folder)
+    return tuple(found)
 
 
 def on_flange(run: PlannedRun | Block) -> str:

@@ -33,7 +33,14 @@ from daq.ledger.audit import (
     witnessed_writes,
 )
 from daq.ledger.dates import corrected, times_by_order
-from daq.ledger.names import RenamedCell, drives_of, names_in, renamed_to, with_present_names
+from daq.ledger.names import (
+    RenamedCell,
+    drives_of,
+    names_in,
+    rename_of,
+    renamed_to,
+    with_present_names,
+)
 from ident.calibration import CalibratedRobot, Calibration, Gain, Source
 
 
@@ -114,6 +121,35 @@ class ForeignEntry:
             f"{found_text(self.differences)}; expected {expected_text(self.differences)}, as in "
             "the cell file"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class IncomparableEntry:
+    """A calibration of this cell with other axes or units than the newest one.
+
+    Earlier versions entered such ones into one history.
+    """
+
+    entry: Entry  #: itself
+    expected: Mapping[str, str]  #: unit of each axis in the newest calibration
+
+    def __str__(self) -> str:
+        found = _units(self.entry)
+        if found.keys() != self.expected.keys():
+            found_text = f"gains of {', '.join(found)}"
+            expected_text = f"of {', '.join(self.expected)}"
+        else:
+            differing = [axis for axis, unit in found.items() if unit != self.expected[axis]]
+            found_text = _units_text(differing, found)
+            expected_text = _units_text(differing, self.expected)
+        return (
+            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is not "
+            f"compared: found {found_text}; expected {expected_text}, as in the newest one"
+        )
+
+
+def _units_text(axes: Sequence[str], units: Mapping[str, str]) -> str:
+    return ", ".join(f"{axis} in {units[axis]}" for axis in axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,10 +311,20 @@ class History:
     #: Calibrations of another robot with the cell's name, oldest first. No change of a gain is
     #: computed with them.
     other_robots: tuple[ForeignEntry, ...] = ()
+    #: Calibrations with other axes or units than the newest one, oldest first. No change of a gain
+    #: is computed with them.
+    not_compared: tuple[IncomparableEntry, ...] = ()
     renamed: RenamedCell | None = None  #: the rename by which this same robot has another name now
     #: Names in the same audit log whose calibrations are all of a robot like this one, where the
     #: cell has none.
     possible_names: tuple[str, ...] = ()
+
+    @property
+    def digests(self) -> frozenset[str]:
+        """SHA-256 of every calibration, also of those that no change of a gain is computed with."""
+        foreign = [one.entry for one in self.other_robots]
+        incomparable = [one.entry for one in self.not_compared]
+        return frozenset(entry.digest for entry in (*self.entries, *foreign, *incomparable))
 
     def in_force(self, target: str | None = None) -> str | None:
         """Return the digest of the calibration in a target, or in the last written one;
@@ -396,7 +442,13 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         else:
             own.append(entry)
     last = _units(own[-1]) if own else {}
-    comparable = [one for one in own if _units(one) == last]
+    comparable = []
+    incomparable = []
+    for entry in own:
+        if _units(entry) == last:
+            comparable.append(entry)
+        else:
+            incomparable.append(IncomparableEntry(entry, last))
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
@@ -404,6 +456,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         acceptances=acceptances,
         unreadable=tuple(unreadable),
         other_robots=tuple(foreign),
+        not_compared=tuple(incomparable),
         renamed=_rename_of_robot(entries, cell.name, robot),
         possible_names=() if calibrations else _names_of_robot(entries, robot),
     )
@@ -490,9 +543,7 @@ def _named(one: EnteredCalibration) -> str:
 
 
 def _units(entry: Entry) -> dict[str, str]:
-    """Return the axes with their units; calibrations with other ones are of a history that an
-    earlier version began.
-    """
+    """Return the axes with their units."""
     return {gain.axis: gain.unit for gain in entry.gains}
 
 
@@ -745,6 +796,26 @@ def shown_writes(
     return [
         one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown
     ]
+
+
+def name_after_renames(entries: Sequence[AuditEntry], name: str, since: datetime) -> str:
+    """Return the name that a cell has after the renames that were entered since a time.
+
+    Args:
+        entries: of the audit log, oldest first.
+        name: of the cell at that time.
+        since: the time, with zone.
+    """
+    times = _times_by_number(entries)
+    found = name
+    for one in entries:
+        rename = rename_of(one)
+        if rename is None or rename.old != found:
+            continue
+        renamed_at = times.get(one.number)
+        if renamed_at is not None and renamed_at >= since:
+            found = rename.new
+    return found
 
 
 def at_of(entry: AuditEntry) -> datetime | None:

@@ -25,6 +25,7 @@ from daq.errors import (
     HistoryUnreadable,
     OutputFailed,
     evidence,
+    first_few,
     reason_of,
     writing,
 )
@@ -51,6 +52,7 @@ from daq.ledger.fold import (
     figures_of,
     fold,
     iso,
+    name_after_renames,
     shown_writes,
     unknown_writes,
 )
@@ -171,17 +173,24 @@ def read_history(ledger: Ledger) -> History:
     return replace(history, may_lack=not verdict.holds)
 
 
-def names_of(cell: Cell) -> frozenset[str]:
-    """Return the name of a cell, and those that it had before its audit log says that it was
-    renamed.
+def present_name(cell: Cell, name: str, at: datetime) -> str:
+    """Return the name that a cell has now by an audit log, which had another name at a time.
+
+    A name that a rename has freed may be another cell's: what was made under it before the rename
+    is of the renamed cell, and what was made later is not.
+
+    Args:
+        cell: whose audit log is read.
+        name: of any cell in that log, at the time.
+        at: time, with zone.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
     """
     ledger = Ledger.of(cell)
     if ledger is None:
-        return frozenset({cell.name})
-    return former_names(verify(ledger.audit).intact, cell.name) | {cell.name}
+        return name
+    return name_after_renames(verify(ledger.audit).intact, name, at)
 
 
 def is_damaged(audit: Path) -> bool:
@@ -212,9 +221,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
-    known = {one.digest for one in history.entries} | {
-        one.entry.digest for one in history.other_robots
-    }
+    known = history.digests
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
     is_noted = bool(noted) or not verdict.entries
     return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
@@ -374,13 +381,15 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
             remedy="give its earlier name as the audit log has it, or correct `history.audit` of "
             "the cell file",
         )
+    incomparable = [one.entry for one in under_old.not_compared]
+    calibrations = [*under_old.entries, *incomparable]
     return PlannedRename(
         old=old,
         new=new,
-        calibrations=len(under_old.entries),
+        calibrations=len(calibrations),
         writes=len(under_old.events),
         acknowledgements=len(under_old.acknowledgements),
-        undescribed=sum(entry.robot is None for entry in under_old.entries),
+        undescribed=sum(entry.robot is None for entry in calibrations),
         entered_at=_entered_rename_at(entries, old, new) if is_entered else None,
     )
 
@@ -436,7 +445,7 @@ def _require_own_robot(ledger: Ledger, history: History) -> None:
             found=found,
             expected=expected,
             remedy="two robots have no common history: give the earlier name of this robot; "
-            "nothing was entered",
+            "nothing was renamed",
         )
 
 
@@ -547,11 +556,9 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
 
 def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
     """Return the error for a history of an earlier version that is broken."""
-    listed = list(flaws)
-    more = len(listed) - _SHOWN
     return HistoryUnreadable(
         str(ledger.stored),
-        found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
+        found=first_few(tuple(flaws), _SHOWN),
         expected="a sound SQLite file whose calibrations can be read",
         remedy="ask who can write to it, and restore the last good one from a backup, or go on "
         "without it: `drivegain history CELL --migrate` keeps it under another name, and takes "
@@ -617,7 +624,7 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     """Refuse a calibration that cannot be compared with those of the history."""
     remedy = (
         "gains are compared over time only where they mean the same: begin another audit log "
-        "(`history.audit` of the cell file); nothing was entered"
+        "(`history.audit` of the cell file); it was not entered"
     )
     units = {gain.axis: gain.unit for gain in calibration.gains}
     known: dict[str, str] = {}
@@ -631,13 +638,13 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     elif robot is not None:
         found = robot.found
         expected = robot.expected
-        remedy = "give the cell file of the robot that was calibrated; nothing was entered"
+        remedy = "give the cell file of the robot that was calibrated; it was not entered"
     elif history.renamed is not None:
         found = (
             f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
         )
         expected = f"{history.renamed.new!r}, its name since"
-        remedy = "give the cell file with the new name; nothing was entered"
+        remedy = f"{history.renamed.remedy}; it was not entered"
     elif history.other_robots:
         found = str(history.other_robots[0])
         expected = "calibrations of one robot in a history"

@@ -22,6 +22,15 @@ class RenamedCell:
     at: str  #: ISO 8601 time with its zone
     robot: object  #: of the cell, as plain JSON; None where the entry lacks it
 
+    @property
+    def remedy(self) -> str:
+        """What to do where a cell file has the old name: a twin with that name looks the same."""
+        return (
+            f"if this is the robot that was renamed, write its present name {self.new!r} into the "
+            "cell file (`name:`); if it is another robot, give it another name, or another audit "
+            "log (`history.audit` of the cell file)"
+        )
+
 
 def drives_of(cell: str) -> str:
     """Return the name of a cell's drives in audit and history."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit
+from daq.errors import TableUnfit, first_few
 from daq.files import read_regular
 from daq.log.table import (
     Stamps,
@@ -361,4 +361,4 @@ def _text(data: memoryview) -> str:
 def _listed(arrays: dict[str, _Array], before: str = "") -> str:
     """Name up to twelve arrays with their sizes."""
     names = [f"{before}{name} ({array})" for name, array in arrays.items()]
-    return ", ".join(names[:12] + [f"{len(names) - 12} more"] * (len(names) > 12)) or "none"
+    return first_few(names, 12, separator=", ") or "none"

@@ -183,6 +183,10 @@ class HistoryReport(Report):
     """calibrations of another robot with the cell's name, each with what differs;
     left out where there are none
     """
+    not_compared: list[str] | None = None
+    """calibrations with other axes or units than the newest one, each with what differs;
+    left out where there are none
+    """
 
 
 def show_history(
@@ -380,6 +384,8 @@ def history_report(
         others = {"audit": audit_report(checked)}
     if history.other_robots:
         others["other_robots"] = [str(one) for one in history.other_robots]
+    if history.not_compared:
+        others["not_compared"] = [str(one) for one in history.not_compared]
     return HistoryReport.of(
         cell=cell,
         calibrations=len(history.entries),

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 
-from daq.errors import counted
+from daq.errors import counted, first_few
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_table, identifiability_notes, sigma_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
@@ -188,10 +188,7 @@ def effect_sizes(calibration: Calibration) -> Iterator[str]:
     and what these data cannot distinguish from it.
     """
     for effect in calibration.effects:
-        more = len(effect.ambiguity) - _SHOWN_RIVALS
-        rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS])
-        if more > 0:
-            rivals += f" and {more} more"
+        rivals = first_few(effect.ambiguity, _SHOWN_RIVALS, separator=", ")
         if rivals:
             rivals = f"; not distinguishable from {rivals}"
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"

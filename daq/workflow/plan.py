@@ -13,7 +13,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from itertools import compress, pairwise
 from pathlib import Path
@@ -23,7 +23,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
-from daq.config.same_cell import RobotIdentity, robot_identity
+from daq.config.same_cell import (
+    calibrated_robot,
+    expected_text,
+    found_text,
+    robot_differences,
+)
 from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError, counted
 from daq.files import replace_file
@@ -48,6 +53,7 @@ from daq.workflow.experiment import (
 from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
+from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot
 from ident.model.robot import Robot
 from ident.planning.clear_way import clear_way
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
@@ -77,7 +83,7 @@ class Plan:
     #: gains
     purpose: str = ""
     #: of the robot it was made for; None in plans of earlier versions
-    robot: RobotIdentity | None = None
+    robot: CalibratedRobot | None = None
 
 
 DWELL_S = 0.1
@@ -664,7 +670,7 @@ def plan(
         duration_s=used_s,
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
-        robot=robot_identity(cell),
+        robot=calibrated_robot(cell),
     )
 
 
@@ -800,9 +806,35 @@ class _Move(StrictModel):
         return self
 
 
+class _Joint(StrictModel):
+    name: str
+    kind: str
+    parent: str
+
+
+class _Drive(StrictModel):
+    axis: str
+    node_id: int | None
+    vendor_id: int | None
+    product_code: int | None
+
+
 class _Robot(StrictModel):
     kinematics_sha256: Digest
     drives_sha256: Digest
+    # Plans of earlier versions have the digests alone.
+    joints: tuple[_Joint, ...] = ()
+    drives: tuple[_Drive, ...] = ()
+    motors: tuple[str, ...] = ()
+
+    @property
+    def robot(self) -> CalibratedRobot:
+        """The robot."""
+        joints = tuple(CalibratedJoint(**joint.model_dump()) for joint in self.joints)
+        drives = tuple(CalibratedDrive(**drive.model_dump()) for drive in self.drives)
+        return CalibratedRobot(
+            self.kinematics_sha256, self.drives_sha256, joints, drives, self.motors
+        )
 
 
 class _Plan(StrictModel):
@@ -863,9 +895,7 @@ def save_plan(plan: Plan, path: Path) -> None:
     if plan.purpose:
         lines.append(f"purpose: {json.dumps(plan.purpose)}")  # a string of JSON is one of YAML
     if plan.robot is not None:
-        lines.append("robot:    # a plan is for one robot")
-        lines.append(f"  kinematics_sha256: {plan.robot.kinematics_sha256}")
-        lines.append(f"  drives_sha256: {plan.robot.drives_sha256}")
+        lines += _robot_lines(plan.robot)
     lines.append("moves:")
     for move in plan.moves:
         target = ", ".join(
@@ -876,6 +906,24 @@ def save_plan(plan: Plan, path: Path) -> None:
             f"{move.acceleration:.4f}, dwell_s: {move.dwell_s:.3f}}}"
         )
     replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def _robot_lines(robot: CalibratedRobot) -> list[str]:
+    lines = [
+        "robot:    # a plan is for one robot",
+        f"  kinematics_sha256: {robot.kinematics_sha256}",
+        f"  drives_sha256: {robot.drives_sha256}",
+    ]
+    # An object of JSON is one of YAML.
+    if robot.joints:
+        lines.append("  joints:")
+        lines += [f"    - {json.dumps(asdict(joint))}" for joint in robot.joints]
+    if robot.drives:
+        lines.append("  drives:")
+        lines += [f"    - {json.dumps(asdict(drive))}" for drive in robot.drives]
+    if robot.motors:
+        lines.append(f"  motors: {json.dumps(robot.motors)}")
+    return lines
 
 
 def load_plan(path: Path, cell: Cell) -> Plan:
@@ -921,21 +969,20 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     )
 
 
-def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> RobotIdentity | None:
+def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> CalibratedRobot | None:
     """Return the robot that a plan is for, None for a plan of an earlier version;
     refuse that of another robot.
     """
     if stated is None:
         return None
-    found = RobotIdentity(stated.kinematics_sha256, stated.drives_sha256)
-    differences = found.differences(robot_identity(cell))
+    found = stated.robot
+    differences = robot_differences(found, calibrated_robot(cell))
     if differences:
-        differing = " and ".join(differences)
         raise _refused(
             f"{path}: robot",
-            f"a plan for another robot with the same cell name {cell.name!r}; what differs: "
-            f"{differing}",
-            "a plan for the robot that the cell file describes",
+            f"a plan for another robot with the same cell name {cell.name!r}: "
+            f"{found_text(differences)}",
+            f"{expected_text(differences)}, as in the cell file",
             "give the cell file that the plan was made with, or make a plan for this cell: "
             "`drivegain plan CELL`",
         )

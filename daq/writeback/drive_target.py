@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -30,7 +30,8 @@ from daq.errors import (
     counted,
 )
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.ledger import names_of
+from daq.ledger.fold import utc
+from daq.ledger.ledger import present_name
 from daq.ledger.names import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
@@ -370,17 +371,20 @@ class DriveTarget:
         unknown_axes = [
             note.axis for note in record.drives if (note.axis, note.node_id) not in axes
         ]
-        if record.cell not in names_of(self.cell) or unknown_axes:
+        never = datetime.min.replace(tzinfo=UTC)
+        present = present_name(self.cell, record.cell, utc(record.at, never))
+        if present != self.cell.name or unknown_axes:
+            found = f"a write to cell {record.cell!r} at {record.at}"
+            if present != record.cell:
+                found += f", which is called {present!r} now"
+            if unknown_axes:
+                found += f", with {', '.join(unknown_axes)} that this cell does not have"
             raise ControllerUnfit(
                 str(path),
-                found=f"a write to cell {record.cell!r}"
-                + (
-                    f", with {', '.join(unknown_axes)} that this cell does not have"
-                    if unknown_axes
-                    else ""
-                ),
-                expected=f"one to the drives of cell {self.cell.name!r}",
-                remedy="nothing was written; has the cell file been changed since?",
+                found=found,
+                expected=f"one to the drives of the cell that is called {self.cell.name!r} now",
+                remedy="nothing was written; has the cell file been changed since, or the cell "
+                "been renamed (`drivegain history`)?",
             )
         return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
 

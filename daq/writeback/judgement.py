@@ -87,10 +87,11 @@ def query_history(
     if history.renamed is not None:
         _LOG.warning(
             "cell %r was renamed to %r at %s: its history is under that name, so the current gains "
-            "are taken as exact; give the cell file with the new name",
+            "are taken as exact; %s",
             cell.name,
             history.renamed.new,
             history.renamed.at,
+            history.renamed.remedy,
         )
     return known_of(history, target, sha256(request.signed), changes)
 

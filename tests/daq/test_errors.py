@@ -6,6 +6,8 @@ import importlib
 import inspect
 import pkgutil
 
+import pytest
+
 import daq
 import drivers
 import ident
@@ -17,6 +19,7 @@ from daq.errors import (
     SchemaMismatch,
     UsageError,
     exit_code,
+    first_few,
 )
 from daq.log.feed import FeedUnfit
 from daq.workflow.urdf_shapes import ShapeUnreadable
@@ -86,3 +89,19 @@ def test_a_message_does_not_repeat_a_damaged_file() -> None:
     error = UsageError("here", found="x" * 10**6, expected="that", remedy="do so")
     assert len(str(error)) < 5000
     assert "996000 more characters" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("count", "shown"),
+    [
+        (0, ""),
+        (1, "a"),
+        (3, "a, b, c"),
+        (4, "a, b, c, and 1 more (see below)"),
+        (6, "a, b, c, and 3 more (see below)"),
+    ],
+)
+def test_the_first_of_many_texts_are_shown_with_the_number_of_the_others(
+    count: int, shown: str
+) -> None:
+    assert first_few("abcdef"[:count], 3, separator=", ", note=" (see below)") == shown

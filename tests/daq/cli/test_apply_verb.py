@@ -714,7 +714,12 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(
     bench: Bench, closed: bool
 ) -> None:
     # The table of `apply` is printed before the write: without --json nothing would be written.
-    for arguments in (["apply", str(bench.calibration), "--yes", "--json"], ["rollback"]):
+    apply = ["apply", str(bench.calibration), "--yes", "--json"]
+    commands = [apply, ["rollback"]]
+    if closed:  # that is seen before the write
+        assert bench.apply("--yes") == ExitCode.OK
+        commands.remove(apply)
+    for arguments in commands:
         before = bench.controller.read_bytes()
         if closed:
             reading, writing = os.pipe()
@@ -733,6 +738,27 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(
         assert re.search(r'^(error: +|\{"error": ")standard output\b', done.stderr, re.MULTILINE)
         assert f"only the printed output is lost: {bench.controller} was written" in done.stderr
         assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
+
+
+def test_a_report_that_nobody_can_read_is_no_report_of_a_write(bench: Bench) -> None:
+    before = bench.controller.read_bytes()
+    arguments = ["apply", str(bench.calibration), "--yes", "--json", "--cell", str(bench.cell)]
+    command = [sys.executable, "-m", "daq", *arguments]
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert done.returncode == ExitCode.UNEXPECTED
+    assert "whose other end is closed" in done.stderr
+    assert "nothing was written" in done.stderr
+    assert bench.controller.read_bytes() == before
+    # A reader that is there, or a file, takes the report.
+    report = bench.cell.with_name("report.json")
+    with report.open("w") as file:
+        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == ExitCode.OK
+    assert json.loads(report.read_text())
+    assert bench.controller.read_bytes() != before
 
 
 def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:

@@ -232,6 +232,14 @@ def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
         assert word in page or code in range(10, 15)
 
 
+def test_the_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    listed = said[said.index("Exit codes:") :].replace("10 to 14", "10 11 12 13 14")
+    numbers = {int(number) for number in re.findall(r"\d+", listed)}
+    assert numbers == {code.value for code in ExitCode}
+
+
 def _span(first: str, last: str) -> range:
     return range(int(first), int(last or first) + 1)
 

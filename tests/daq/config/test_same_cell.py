@@ -21,12 +21,14 @@ from daq.config.same_cell import (
     differing_zeros,
     mismatch,
     mismatch_of_calibration,
-    robot_identity,
+    robot_differences,
 )
 from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
-from daq.errors import ExitCode, LogsDiffer
+from daq.errors import ConfigurationInconsistent, ExitCode, LogsDiffer
 from daq.log.conversion import load_run
+from daq.workflow.experiment import PlannedMove
 from daq.workflow.fit import Reading
+from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.weigh import weigh_logs
 from ident.calibration import Calibration, Source
 from ident.data.conditioning import Conditioning
@@ -78,7 +80,10 @@ OTHERS: dict[str, tuple[Callable[[str], str], str]] = {
         "a log of cell 'demo'; expected one of cell 'press'",
     ),
     "another axis": (_replaced("name: J2", "name: A2"), "axes J1, J2, .*; expected J1, A2"),
-    "another node": (_replaced("node_id: 3", "node_id: 33"), "node id 3 of axis J3; expected 33"),
+    "another node": (
+        _replaced("node_id: 3", "node_id: 33"),
+        "drive of J3 with node id 3; expected drive of J3 with node id 33",
+    ),
 }
 
 
@@ -104,7 +109,8 @@ def test_a_log_of_exchanged_node_numbers_is_to_be_recorded_again(checkout: Path,
     )
     with pytest.raises(
         LogsDiffer,
-        match=r"node id 1 of axis J1; expected 2.*record again with the corrected "
+        match=r"drive of J1 with node id 1; .*; expected drive of J1 with node id 2; .*record "
+        r"again with the corrected "
         r"cell file",
     ):
         load_run(log, replace(cell, axes=exchanged))
@@ -448,14 +454,83 @@ def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(checkou
     )
 
 
-def test_a_calibration_has_the_digests_of_a_plan_of_its_robot(checkout: Path) -> None:
+def _without_vendors(cell: Cell) -> Cell:
+    return replace(cell, axes=tuple(replace(axis, identity=None) for axis in cell.axes))
+
+
+def _with_another_vendor(cell: Cell) -> Cell:
+    first = cell.axes[0]
+    assert first.identity is not None
+    identity = replace(first.identity, vendor_id=first.identity.vendor_id + 1)
+    return replace(cell, axes=(replace(first, identity=identity), *cell.axes[1:]))
+
+
+def _with_a_sliding_joint(cell: Cell) -> Cell:
+    return replace(cell, urdf=cell.urdf.replace('type="revolute"', 'type="prismatic"', 1))
+
+
+def _with_another_parent(cell: Cell) -> Cell:
+    """The last joint on the base, beside the arm."""
+    root = re.search(r'<parent link="([^"]+)"', cell.urdf)
+    last = list(re.finditer(r'<parent link="([^"]+)"', cell.urdf))[-1]
+    assert root is not None
+    urdf = cell.urdf[: last.start(1)] + root[1] + cell.urdf[last.end(1) :]
+    return replace(cell, urdf=urdf)
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        (_without_vendors, True),
+        (_with_another_vendor, False),
+        (_with_a_sliding_joint, False),
+        (_with_another_parent, False),
+    ],
+)
+def test_logs_plans_and_calibrations_agree_on_what_one_robot_is(
+    change: Callable[[Cell], Cell], same: bool, checkout: Path, tmp_path: Path
+) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    for made_with, used_with in ((demo, change(demo)), (change(demo), demo)):
+        calibration = replace(_calibration("demo"), robot=calibrated_robot(made_with))
+        plan_file = tmp_path / "plan.yaml"
+        move = PlannedMove((0.0,) * 6, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+        made = Plan(
+            cell="demo",
+            seed=1,
+            condition=1.0,
+            predicted_std_percent=(),
+            duration_s=1.0,
+            moves=(move,),
+            units=tuple(axis.unit for axis in demo.axes),
+            robot=calibrated_robot(made_with),
+        )
+        save_plan(made, plan_file)
+        refused = []
+        if mismatch(made_with, used_with) is not None:
+            refused.append("log")
+        if mismatch_of_calibration(calibration, used_with) is not None:
+            refused.append("calibration")
+        try:
+            read = load_plan(plan_file, used_with)
+        except ConfigurationInconsistent as error:
+            assert error.subject == f"{plan_file}: robot"
+            refused.append("plan")
+        else:
+            assert read.robot == made.robot
+        assert refused == ([] if same else ["log", "calibration", "plan"])
+
+
+def test_a_robot_with_fewer_axes_is_named_by_its_axes(checkout: Path) -> None:
+    robot = calibrated_robot(load_cell(checkout / "configs/cells/demo.yaml"))
+    (difference,) = robot_differences(replace(robot, drives=robot.drives[:2]), robot)
+    assert difference.found == "axes J1, J2"
+    assert difference.expected == "axes J1, J2, J3, J4, J5, J6"
+
+
+def test_a_calibration_keeps_the_robot_that_it_is_of(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     robot = calibrated_robot(demo)
-    identity = robot_identity(demo)
-    assert (robot.kinematics_sha256, robot.drives_sha256) == (
-        identity.kinematics_sha256,
-        identity.drives_sha256,
-    )
     content = encode_calibration(replace(_calibration("demo"), robot=robot))
     assert decode_calibration(content, "calibration.yaml").robot == robot
     assert f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}".encode() in content

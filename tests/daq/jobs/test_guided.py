@@ -1254,7 +1254,23 @@ def test_a_person_who_answers_every_prompt_calibrates(
     assert applied.who == "a person"
 
 
-@pytest.mark.parametrize("answer", ["", "y", "Yes", "no"])
+@pytest.mark.parametrize("answer", ["Yes", "YES", "y\nyes"])
+def test_yes_in_either_case_writes_and_a_slip_is_asked_again(
+    tmp_path: Path,
+    made_session: MadeSession,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answer: str,
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n" + "\n\n"
+    assert run_session(rig, person(rig, monkeypatch, typed)).outcome is Outcome.APPLIED
+    assert ("Found 'y', expected yes, or Enter alone." in capsys.readouterr().err) == (
+        answer.startswith("y\n")
+    )
+
+
+@pytest.mark.parametrize("answer", ["", "no", "No", "y\n"])
 def test_anything_but_yes_leaves_the_controller(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch, answer: str
 ) -> None:
@@ -1262,6 +1278,23 @@ def test_anything_but_yes_leaves_the_controller(
     typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n"
     ended = run_session(rig, person(rig, monkeypatch, typed))
     assert ended.outcome is Outcome.PROPOSED
+
+
+@pytest.mark.parametrize(
+    ("typed", "is_again"), [("keep\n", False), ("Keep\n", False), ("\n", True), ("kep\n\n", True)]
+)
+def test_keep_in_either_case_keeps_a_block(
+    tmp_path: Path,
+    made_session: MadeSession,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: str,
+    is_again: bool,
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    run = PlannedRun(name="bare-1", plan_file=Path("plan-1.yaml"))
+    operator = person(rig, monkeypatch, typed)
+    assert operator.record_again(run, ["bare-1"], "a mistake") == is_again
+    assert sys.stdin.read() == ""
 
 
 def test_the_mass_is_asked_again_until_it_is_the_same_twice(

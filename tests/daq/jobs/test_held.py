@@ -114,6 +114,7 @@ def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(
     )
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert "a robot that was renamed to 'press'" in str(error)
+    assert "if it is another robot, give it another name, or another audit log" in str(error)
     assert asked == []
 
 

@@ -143,7 +143,7 @@ def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> N
         enter(ledger, other)
     assert len(read(ledger.audit)) == len(read_history(ledger).entries) == 1
     assert exit_code(DataError) == 4
-    assert "nothing was entered" in refused.value.remedy
+    assert "it was not entered" in refused.value.remedy
 
 
 def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:

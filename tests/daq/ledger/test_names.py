@@ -5,9 +5,10 @@ and a renamed cell keeps its history.
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -22,13 +23,15 @@ from daq.errors import DataError, ExitCode
 from daq.files import sha256
 from daq.jobs.position import sessions_folder
 from daq.jobs.session import Basis, begin, rename_sessions, sessions
-from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger import ledger as ledger_module
+from daq.ledger.audit import AuditAction, append, read, verify
+from daq.ledger.fold import figures_of
 from daq.ledger.ledger import (
     Ledger,
     acknowledge,
     enter_calibration,
-    names_of,
     plan_rename,
+    present_name,
     read_history,
     read_standing,
     record_session,
@@ -363,13 +366,170 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert "drivegain-recalibrate-demo.timer" in captured.err
     assert len(sessions(sessions_folder(cell_file), "press")) == 1
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
-    assert names_of(load_cell(cell_file)) == {"press", "demo"}
+    press = load_cell(cell_file)
+    assert present_name(press, "demo", BEGIN) == "press"
+    assert present_name(press, "demo", datetime.now(UTC)) == "demo"
+    assert present_name(press, "press", BEGIN) == "press"
     # A copy of the cell file with the old name, as a schedule may have.
     cell_file.write_text(
         cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
     )
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
+    assert "if it is another robot, give it another name, or another audit log" in caplog.text
+
+
+def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
+    ledger: Ledger, renamed: Ledger
+) -> None:
+    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    twin = _made(ledger.cell, 12)
+    with pytest.raises(DataError, match="which this robot had until") as caught:
+        _enter(ledger, twin, 12)
+    assert "if it is another robot, give it another name, or another audit log" in str(caught.value)
+    # Either way is one that works.
+    named = _named(ledger, "twin")
+    _enter(named, replace(twin, cell="twin"), 12)
+    assert len(read_history(named).entries) == 1
+    elsewhere = replace(ledger, audit=ledger.audit.with_name("twin.audit.jsonl"))
+    _enter(elsewhere, twin, 12)
+    assert len(read_history(elsewhere).entries) == 1
+    assert read_history(elsewhere).renamed is None
+
+
+def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
+    cell_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    text = text.replace("name: press", "name: press\nhistory: {audit: cell.audit.jsonl}", 1)
+    press = cell_file.with_name("press.yaml")
+    cell_file.rename(press)
+    press.write_text(text, encoding="utf-8")
+    left_behind = sessions_folder(cell_file)
+    elsewhere = tmp_path / "elsewhere"
+    _sessions_of(elsewhere, "demo", 1)
+    # Beside its own cell file, which is still there, a session is of that one.
+    others = tmp_path / "other.sessions"
+    _sessions_of(others, "demo", 1)
+    others.with_suffix(".yaml").touch()
+    absent = ["--rename", "demo", "--sessions", str(tmp_path / "absent")]
+    assert main(["history", str(press), *absent]) == ExitCode.USAGE
+    options = ["--rename", "demo", "--sessions", str(elsewhere)]
+    assert main(["history", str(press), *options]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert "2 sessions. Nothing was renamed; --yes does it." in said
+    assert main(["history", str(press), *options, "--yes"]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"1 session in {left_behind}, where `drivegain calibrate` looks with --sessions" in said
+    assert len(sessions(left_behind, "press")) == 1
+    assert len(sessions(elsewhere, "press")) == 1
+    assert len(sessions(others, "demo")) == 1
+
+
+def test_who_adds_or_renames_is_recorded(cell_file: Path) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    audit = cell_file.with_name("cell.audit.jsonl")
+    assert main(["history", str(cell_file), "--add", str(added), "--by", "Ada"]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.CALIBRATION_ENTERED
+    assert read(audit)[-1].who.startswith("Ada")
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    rename = ["--rename", "demo", "--yes", "--by", "Bert"]
+    assert main(["history", str(cell_file), *rename]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.RENAMED
+    assert read(audit)[-1].who.startswith("Bert")
+    assert main(["history", str(cell_file), "--by", "Cleo"]) == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("verb", ["--add", "--rename", "--acknowledge"])
+def test_an_interrupt_after_an_entry_says_what_was_entered(
+    cell_file: Path,
+    verb: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    name = "demo"
+    if verb == "--rename":
+        name = "press"
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", f"name: {name}", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    arguments, entering, expected = {
+        "--add": ([str(added)], "enter_calibration", f"{added} was entered into"),
+        "--rename": (["demo", "--yes"], "rename_cell", "has the rename of 'demo' to 'press'"),
+        "--acknowledge": (
+            ["J1", "--why", "new gearbox"],
+            "acknowledge",
+            "the change of J1 was entered as explained into",
+        ),
+    }[verb]
+    enter = getattr(ledger_module, entering)
+
+    def enter_and_interrupt(*values: object, **options: object) -> object:
+        result = enter(*values, **options)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(ledger_module, entering, enter_and_interrupt)
+    before = len(read(cell_file.with_name("cell.audit.jsonl")))
+    assert main(["history", str(cell_file), verb, *arguments]) == ExitCode.INTERRUPTED
+    assert len(read(cell_file.with_name("cell.audit.jsonl"))) == before + 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert expected in said
+    assert "no file was written" not in said
+
+
+def _enter_unchecked(ledger: Ledger, calibration: Calibration, at: datetime) -> str:
+    """Enter a calibration as earlier versions did, which compared neither axes nor units."""
+    digest = digest_of(calibration)
+    details = {
+        "sha256": digest,
+        "cell": ledger.cell.name,
+        "entered": at.isoformat(),
+        "figures": figures_of(calibration, digest, at),
+    }
+    append(
+        ledger.audit,
+        AuditAction.CALIBRATION_ENTERED,
+        at=at,
+        who="anna",
+        subject=f"history of {ledger.cell.name}",
+        details=details,
+    )
+    return digest
+
+
+def test_calibrations_with_other_axes_or_units_are_counted_and_their_writes_known(
+    cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = Ledger.of(load_cell(cell_file))
+    assert ledger is not None
+    four = _made(ledger.cell, 3)
+    four = replace(four, gains=four.gains[:4])
+    milli = _made(ledger.cell, 4)
+    first = replace(milli.gains[0], unit="Nm/mA")
+    milli = replace(milli, gains=(first, *milli.gains[1:]))
+    digests = []
+    for week, calibration in ((3, four), (4, milli)):
+        at = BEGIN + timedelta(weeks=week)
+        digest = _enter_unchecked(ledger, calibration, at)
+        write(ledger, drives_of("demo"), sha256(str(week).encode()), digest=digest, at=at)
+        digests.append(digest)
+    _enter_unchecked(ledger, _made(ledger.cell, 5), BEGIN + timedelta(weeks=5))
+    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
+    report = json.loads(capsys.readouterr().out)
+    assert report["calibrations"] == 3
+    by_axes, by_unit = report["not_compared"]
+    assert digests[0][:12] in by_axes
+    assert "found gains of J1, J2, J3, J4; expected of J1, J2, J3, J4, J5, J6, as in" in by_axes
+    assert digests[1][:12] in by_unit
+    assert "found J1 in Nm/mA; expected J1 in" in by_unit
+    assert "2 calibrations left out of tables, drift and alarms" in caplog.text
+    assert by_axes in caplog.text
+    assert verify_ledger(ledger).unknown == ()
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
 
 
 def test_the_verb_says_in_what_another_robot_differs(

@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 from daq.cli import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.config.same_cell import calibrated_robot
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, load_plan, plan, save_plan, way_to_first_target
 from drivers.errors import MotionRefused
+from ident.calibration import CalibratedRobot
 from ident.model.urdf import read_urdf
 from ident.planning.clearance import Box
 
@@ -114,21 +116,21 @@ def _with_other_product(cell: Cell) -> Cell:
     return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
 
 
-OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str]] = {
+OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str, str]] = {
     "another joint": (
         _with_joint_renamed,
-        r"what differs: joints \(names, kinds, parents or "
-        r"motors\);",
+        r"joint \S+ \(revolute, behind .*; expected joint another \(revolute",
+        "joints",
     ),
     "another node": (
         _with_other_node,
-        r"what differs: drives \(node ids, vendors or "
-        r"product codes\);",
+        r"drive of J3 with node id 3; expected drive of J3 with node id 33",
+        "drives",
     ),
     "another product": (
         _with_other_product,
-        r"what differs: drives \(node ids, vendors or "
-        r"product codes\);",
+        r"drive of J3 with product code 0x40200; expected .* with product code 0x7",
+        "drives",
     ),
 }
 
@@ -137,13 +139,33 @@ OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str]] = {
 def test_a_plan_of_another_robot_with_the_same_cell_name_is_refused(
     kind: str, demo: Cell, made: Plan, tmp_path: Path
 ) -> None:
-    change, message = OTHER_ROBOTS[kind]
+    change, message, part = OTHER_ROBOTS[kind]
     other = change(demo)
     assert other.name == demo.name
     path = tmp_path / "plan.yaml"
     save_plan(made, path)
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_plan(path, other)
+    # A plan of an earlier version has the digests alone.
+    assert made.robot is not None
+    save_plan(replace(made, robot=_digests_alone(made.robot)), path)
+    with pytest.raises(ConfigurationInconsistent, match=f"other {part}.*; expected the same"):
+        load_plan(path, other)
+
+
+def test_a_plan_is_of_the_same_robot_once_its_cell_file_says_more_of_the_drives(
+    demo: Cell, made: Plan, tmp_path: Path
+) -> None:
+    unnamed = replace(demo, axes=tuple(replace(axis, identity=None) for axis in demo.axes))
+    robot = calibrated_robot(unnamed)
+    path = tmp_path / "plan.yaml"
+    for stated in (robot, _digests_alone(robot)):
+        save_plan(replace(made, robot=stated), path)
+        assert load_plan(path, demo).robot == stated
+
+
+def _digests_alone(robot: CalibratedRobot) -> CalibratedRobot:
+    return replace(robot, joints=(), drives=(), motors=())
 
 
 def test_a_plan_is_read_with_a_corrected_description(

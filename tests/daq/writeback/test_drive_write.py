@@ -24,7 +24,7 @@ from daq.errors import (
     ControllerUnfit,
 )
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.ledger import Ledger, plan_rename, read_history, rename_cell
+from daq.ledger.ledger import Ledger, acknowledge, plan_rename, read_history, rename_cell
 from daq.ledger.names import drives_of
 from daq.writeback.drive_target import (
     DriveEdit,
@@ -649,8 +649,8 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
             network_of(press, address) as network,
             pytest.raises(
                 ControllerUnfit,
-                match=r"a write to cell 'demo'; expected one to the "
-                r"drives of cell 'press'",
+                match=r"a write to cell 'demo' at 2025-01-02.*; expected one to the "
+                r"drives of the cell that is called 'press' now",
             ),
         ):
             rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
@@ -659,6 +659,36 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
             rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
         assert _gains(simulation) == IN_DRIVES
     assert [event.target for event in read_history(ledger).events] == [drives_of("press")] * 2
+
+
+@pytest.mark.parametrize("renamed_after_s", [-60, 60])
+def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
+    address: BusAddress, tmp_path: Path, renamed_after_s: int
+) -> None:
+    demo = demo_cell(tmp_path)
+    press = replace(demo, name="press")
+    ledger = Ledger.of(press)
+    assert ledger is not None
+    renamed_at = NOW + timedelta(seconds=renamed_after_s)
+    # Something under the old name, without which there is nothing to rename.
+    acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
+    with simulated(address) as simulation:
+        if renamed_after_s < 0:
+            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+        _write(demo, address)
+        if renamed_after_s > 0:
+            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+        written = _gains(simulation)
+        owner, other = (demo, press) if renamed_after_s < 0 else (press, demo)
+        with (
+            network_of(other, address) as network,
+            pytest.raises(ControllerUnfit, match=f"expected .* called '{other.name}' now"),
+        ):
+            rollback(DriveTarget(other, network), NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == written
+        with network_of(owner, address) as network:
+            rollback(DriveTarget(owner, network), NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == IN_DRIVES
 
 
 def test_a_rollback_that_would_lose_what_someone_did_is_refused(
