@@ -267,7 +267,7 @@ def declared_signals(
     motion, leverage = data.motion(), np.empty((0, 0, 0))
     load, geared, total = model.torques(motion, standard)
     position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-    if model.robot.closures:
+    if model.robot.undriven_names:
         followed = model.follow(motion)
         placed = model.at_places(followed)
         position = placed.position_rad

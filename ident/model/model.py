@@ -210,10 +210,10 @@ class Model:
         for link in range(count):
             first = JOINT_COLUMNS * link
             joint = link
-            while joint >= 0 and not self.robot.closures:  # a link loads its own joint and those before it
+            while joint >= 0 and not self.robot.is_constrained:  # a link loads its own joint and those before it
                 out[joint, first : first + 10] = True
                 joint = self.robot.joints[joint].parent
-            if self.robot.closures:
+            if self.robot.is_constrained:
                 out[:, first : first + 10] = True
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
@@ -235,7 +235,7 @@ class Model:
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return self._tree_regressor(*self._joint_first(motion), loaded=loaded)
         columns, to_motors = self.balance(motion, loaded=loaded)
         return spread(columns, to_motors) if self.is_redundant else columns
@@ -265,7 +265,7 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         states = self._joint_first(motion)
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return follow(self.robot, self.assembly, motion)
         digest = blake2b(b"".join(state.tobytes() for state in states)).digest()
         # Replaced as a whole: of two threads, one may lose what the other has added, but neither finds half of it.
@@ -341,7 +341,7 @@ class Model:
         links = standard[:of_joints].reshape(-1, JOINT_COLUMNS)
         motors = standard[of_joints : of_joints + 3 * len(self.drive_train.coupled)].reshape(-1, 3, 1)
         own = links[list(self.robot.axis_joints)]
-        followed = self.follow(motion) if self.robot.closures else None
+        followed = self.follow(motion) if self.robot.is_constrained else None
         if followed is None:
             load = rigid_torque(self.robot, position, velocity, acceleration, links[:, :10])
         else:
@@ -368,7 +368,7 @@ class Model:
             ModelError: the loops cannot be closed.
         """
         links = standard[self.link_columns]
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return mass_matrix(self.robot, np.ascontiguousarray(position_rad.T), links)
         still = np.zeros_like(position_rad)
         followed = self.follow(Motion(position_rad, still, still))
@@ -379,7 +379,7 @@ class Model:
 
     def leverage(self, followed: TreeMotion) -> FloatArray:
         """Torque at each axis per unit of torque on each place without a motor (`Robot.places`), shape (u, m, k)."""
-        unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
+        unit = np.eye(self.robot.joint_count)[:, list(self.robot.place_joints[self.robot.axis_count :])]
         torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
         per_joint = pivot_rates(self.robot, followed.joints.position_rad)
         torque = np.concatenate((torque, np.transpose(per_joint, (2, 1, 0))), axis=1)
@@ -387,7 +387,7 @@ class Model:
 
     def at_places(self, followed: TreeMotion) -> Motion:
         """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k, places)."""
-        joints = [*self.robot.axis_joints, *self.robot.passive_joints]
+        joints = list(self.robot.place_joints)
         tree = followed.joints
         pivots = pivot_motion(self.robot, self.assembly, tree)
         return Motion(
