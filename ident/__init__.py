@@ -150,6 +150,7 @@ if TYPE_CHECKING:  # the names of a module stand together
     from ident.model.robot import (
         Closure as Closure,
         Joint as Joint,
+        JointCoupling as JointCoupling,
         JointKind as JointKind,
         Motion as Motion,
         Pivot as Pivot,

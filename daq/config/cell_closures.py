@@ -17,7 +17,7 @@ from daq.config.yaml_file import Fault, Name, StrictModel
 from ident.errors import ModelError
 from ident.model.closed_chain import assemble
 from ident.model.robot import Joint, JointKind, Place, Robot
-from ident.model.urdf import LinkPair, UrdfRobot, read_urdf, robot_from_urdf
+from ident.model.urdf import LinkPair, UrdfRobot, mimics_of, read_urdf, robot_from_urdf
 
 Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
 
@@ -64,14 +64,18 @@ class ChainModel(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ClosedChain:
-    """How the loops of a URDF's tree close."""
+    """How the loops of a URDF's tree close, or which of its joints have motors where others follow
+    them.
+    """
 
     closures: tuple[LinkPair, ...]
     motors: tuple[str, ...]  #: joint of each axis, in the order of the axes
     platform: str | None  #: link that carries the payload; that of the last joint when None
     #: roughly, positions of all joints at which the closures hold [rad or m]
     assembly_rad: dict[str, float]
-    passive_joints: tuple[Joint, ...]  #: joints without a motor, in the order of the URDF's tree
+    #: Joints without a motor, in the order of the URDF's tree; not those that follow another one in
+    #: a fixed ratio.
+    passive_joints: tuple[Joint, ...]
     #: names of the joints that the loops are cut at and that turn about one axis
     pivots: tuple[str, ...] = ()
 
@@ -84,13 +88,13 @@ class ClosedChain:
 def chain_of(
     robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str
 ) -> ClosedChain | None:
-    """Return the closed chain of a cell file, None of a serial robot.
+    """Return the closed chain of a cell file, None of a serial robot whose every joint has a motor.
 
     Raises:
         ModelError: the URDF cannot be read.
     """
     if not closures:
-        return None
+        return _followed_chain(robot, urdf)
     revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
@@ -99,6 +103,15 @@ def chain_of(
     # Which closures are pivots does not depend on gravity.
     closed = robot_with(chain, urdf, STANDING)
     return replace(chain, pivots=closed.pivot_names)
+
+
+def _followed_chain(robot: ChainModel, urdf: str) -> ClosedChain | None:
+    """Return the chain of a robot without loops in which joints mimic axes; None if none does."""
+    followers = mimics_of(urdf)
+    if not followers:
+        return None
+    motors = tuple(joint.name for joint in read_urdf(urdf).joints if joint.name not in followers)
+    return ClosedChain((), motors, robot.platform, {}, ())
 
 
 def platform_frame(robot: ChainModel, urdf: str) -> Place:

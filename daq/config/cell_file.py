@@ -376,7 +376,7 @@ def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str,
     if chain is None:
         return {name: index for index, name in enumerate(model.axis_names)}
     index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
-    passive = {joint.name: index[joint.name] for joint in chain.passive_joints}
+    passive = {name: number for name, number in index.items() if name not in chain.motors}
     return passive | {
         name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)
     }

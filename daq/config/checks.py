@@ -30,7 +30,7 @@ from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
-from ident.model.urdf import LINKAGE, Mimic, mimics_of
+from ident.model.urdf import first_leader, mimics_of, read_urdf
 from ident.plausible import (
     ACCELERATION,
     FARTHEST_CENTRE_M,
@@ -152,7 +152,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         return None, [*faults, Fault(("robot", "urdf"), found, expected)]
     names = [joint.name for joint in robot.axes]
     more = len(names) - len(axes)
-    if more and chain is not None:
+    if more and model.closures:
         found = f"{len(names)} joints for {len(axes)} axes"
         faults.append(
             Fault(
@@ -196,8 +196,8 @@ def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
 
 
 def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
-    """Find joints that mimic another one and still move:
-    the equations give each joint a motion of its own.
+    """Find joints that mimic another one and follow no axis:
+    such a joint stays, or its leader has to be held.
 
     Args:
         axes: names of the axes.
@@ -205,9 +205,12 @@ def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
             it.
 
     Raises:
-        ModelError: the URDF cannot be read.
+        ModelError: the URDF cannot be read, or joints mimic each other.
     """
     mimics = mimics_of(urdf)
+    if not mimics:
+        return
+    leaders = [joint.name for joint in read_urdf(urdf).joints if joint.name not in mimics]
     for name, mimic in mimics.items():
         found = f"joint {name} mimics {mimic.leader} (multiplier {mimic.multiplier:g})"
         if mimic.at_rest:
@@ -217,26 +220,15 @@ def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
             )
             yield Fault(("robot", "urdf"), found, expected)
             continue
-        first = _first_leader(name, mimics)
-        if first in axes:
-            yield Fault(("robot", "urdf"), found, LINKAGE)
-        else:
+        first = first_leader(name, mimics).leader
+        # Axes may have other names than their joints, so names count only where there are joints
+        # without an axis.
+        if first not in leaders or (len(leaders) > len(axes) and first not in axes):
             expected = (
-                f"`hold` of {first} if that is no axis, and {name} follows it; else {LINKAGE}"
+                f"`hold` of {first} if that is no axis, and {name} follows it; else an axis of "
+                f"{first}"
             )
             yield Fault(("robot", "urdf"), found, expected)
-
-
-def _first_leader(name: str, mimics: Mapping[str, Mimic]) -> str:
-    """Return the joint at the head of a chain of followers;
-    one of them where they follow each other in a circle.
-    """
-    seen = {name}
-    leader = mimics[name].leader
-    while leader in mimics and leader not in seen:
-        seen.add(leader)
-        leader = mimics[leader].leader
-    return leader
 
 
 def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:

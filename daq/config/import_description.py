@@ -136,7 +136,16 @@ class Section:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PositionColumns(Section):
+class PublishedColumns(Section):
+    """Columns of a quantity that a bag has, too."""
+
+    topic: str | None = None  #: topic of these columns in a bag; that of the description by default
+    #: their publisher; that of the description by default
+    publisher: Annotated[int, Field(ge=1)] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionColumns(PublishedColumns):
     """Position columns, one for each axis."""
 
     unit: PositionUnit
@@ -145,7 +154,7 @@ class PositionColumns(Section):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScaledColumns(Section):
+class ScaledColumns(PublishedColumns):
     """Columns of a quantity, one for each axis, and the factor to its unit."""
 
     #: One for all axes, a list in their order, or a mapping from their names.
@@ -213,7 +222,7 @@ class VelocityUnit(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityColumns(Section):
+class VelocityColumns(PublishedColumns):
     """Velocity columns, one for each axis: a check of the positions and the time; not imported."""
 
     unit: VelocityUnit
@@ -304,6 +313,8 @@ class ImportDescription(StrictModel):
     #: Which publisher of that topic, by the number that an import names; needed if several publish
     #: the same joints.
     publisher: Annotated[int, Field(ge=1)] | None = None
+    #: Which of two even rows of stamps in a bag; needed if nothing else tells two publishers apart.
+    rhythm: Annotated[int, Field(ge=1, le=2)] | None = None
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
@@ -315,6 +326,11 @@ class ImportDescription(StrictModel):
             for key in ("position", "current", "velocity", "torque", "temperature")
         )
         return tuple((key, section) for key, section in stated if section is not None)
+
+    def published(self) -> tuple[PublishedColumns, ...]:
+        """Return the sections that a bag may have."""
+        stated = (self.position, self.current, self.velocity, self.torque)
+        return tuple(section for section in stated if section is not None)
 
     def files(self) -> dict[str, tuple[Column, ...]]:
         """Return the files, each with its columns of numbers; the time column is not among them."""

@@ -97,7 +97,9 @@ class SqliteBag:
             "SELECT id, name, type, serialization_format FROM topics"
         ):
             self._spend(row, BYTES_A_TOPIC + len(str(name)))
-            topics[row] = Topic(str(name), schema == JOINTS_SCHEMA and encoding == "cdr")
+            has_joint_states = schema == JOINTS_SCHEMA and encoding == "cdr"
+            others = [topic for topic in topics.values() if topic.name == str(name)]
+            topics[row] = Topic(str(name), has_joint_states, channel=len(others) + 1)
         for row, number, time_ns, data in database.execute(
             "SELECT id, topic_id, timestamp, data FROM messages"
         ):

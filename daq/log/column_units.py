@@ -258,7 +258,7 @@ def check_units(
         expected: what the description says of the columns.
 
     Raises:
-        TableUnfit: a unit contradicts the description.
+        TableUnfit: a unit contradicts the description, or the line of units the name of its column.
     """
     for one in expected:
         index = _index(one.column, names)
@@ -268,8 +268,29 @@ def check_units(
         in_name = name_unit(names[index])
         if fields is not None:
             check_unit(at, fields[index], one)
+            if in_name is not None:
+                _require_alike(at, fields[index], in_name)
         elif in_name is not None:
             check_unit(at, in_name, one, in_name=True)
+
+
+def _require_alike(place: str, in_line: str, in_name: str) -> None:
+    """Refuse a unit in the line of units beside another one of the same quantity in the column's
+    name.
+
+    Letters in a name may mean something else than a quantity of another kind.
+    """
+    stated = column_unit_of(in_line)
+    named = column_unit_of(in_name)
+    if stated is None or named is None or stated.kind != named.kind or stated == named:
+        return
+    raise TableUnfit(
+        place,
+        found=f"unit {bare_unit(in_line)!r} in the line of units, and {bare_unit(in_name)!r} in "
+        "the name of the column",
+        expected="one unit of a column",
+        remedy="correct the one that is wrong in the file",
+    )
 
 
 def _index(column: Column, names: Sequence[str]) -> int | None:

@@ -61,7 +61,7 @@ def read_csv(
         if wanted.keep is not None and wanted.keep.is_by_time:
             rows = rows_in_time(stamps, wanted.keep)
             require_kept(path, len(lines.rows), rows)
-            lines = lines.part(rows)
+            lines = lines.select_rows(rows)
             stamps = cut_stamps(stamps, rows)
     beside = None
     if time is None and wanted.time is not None and lines.names.count(str(wanted.time.column)) == 1:
@@ -69,7 +69,7 @@ def read_csv(
     values = _numbers(lines, columns)
     digest = sha256("\n".join(lines.rows).encode())
     return Table(
-        path, columns, values, digest, stamps, lines.numbers, lines.first_row, remarks, beside
+        path, columns, values, digest, stamps, lines.line_numbers, lines.first_row, remarks, beside
     )
 
 
@@ -110,7 +110,7 @@ def _increasing(file: CsvLines) -> list[Column]:
     fields = [file.fields(row) for row in file.rows]
     found: list[Column] = []
     for index in range(len(fields[0])):
-        values = np.array([file.number(row[index]) for row in fields])
+        values = np.array([file.to_number(row[index]) for row in fields])
         if np.isfinite(values).all() and (np.diff(values) > 0.0).all():
             found.append(file.names[index] if file.names else index + 1)
     return found
@@ -118,7 +118,9 @@ def _increasing(file: CsvLines) -> list[Column]:
 
 def _stamps(file: CsvLines, time: TimeColumn, values: FloatArray) -> tuple[Stamps, tuple[str, ...]]:
     """Return the stamps of a column of numbers; those since 1970 are read again, digit by digit."""
-    check_reach(values * time.unit.seconds, lambda row: f"{file.line(row)}, column {time.column}")
+    check_reach(
+        values * time.unit.seconds, lambda row: f"{file.row_place(row)}, column {time.column}"
+    )
     if abs(values[0]) * time.unit.seconds < ABSOLUTE_S:
         time_s, remarks = without_wraps(values * time.unit.seconds, counter_wraps())
         if remarks:
@@ -139,7 +141,7 @@ def _dates(file: CsvLines, time: TimeColumn) -> Stamps:
     )
     stamp_ns = _texts_ns(file, time, _date_ns, expected, remedy)
     seconds = np.array([1e-9 * date_ns for date_ns in stamp_ns])
-    check_reach(seconds, lambda row: f"{file.line(row)}, column {time.column}")
+    check_reach(seconds, lambda row: f"{file.row_place(row)}, column {time.column}")
     return stamps_of_ns(stamp_ns)
 
 
@@ -176,7 +178,7 @@ def _texts_ns(
         text = file.fields(row)[index]
         one_ns = read(text)
         if one_ns is None:
-            place = f"{file.line(number)}, column {time.column}"
+            place = f"{file.row_place(number)}, column {time.column}"
             raise TableUnfit(place, found=repr(text), expected=expected, remedy=remedy)
         stamp_ns.append(one_ns)
     return stamp_ns
@@ -236,7 +238,7 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
     numbers = array("d")
     for row in file.rows:
         fields = file.fields(row)
-        numbers.extend([file.number(fields[index]) for index in indices])
+        numbers.extend([file.to_number(fields[index]) for index in indices])
     values = np.asarray(numbers).reshape(len(file.rows), len(indices))
     wrong = np.argwhere(~np.isfinite(values))
     if wrong.size:
@@ -245,7 +247,10 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
         text = file.fields(file.rows[number])[index]
         remedy = _remedy(file, number, text, values)
         raise TableUnfit(
-            file.place(number, index), found=repr(text), expected="a finite number", remedy=remedy
+            file.field_place(number, index),
+            found=repr(text),
+            expected="a finite number",
+            remedy=remedy,
         )
     _check_points(file, indices)
     for index, own in zip(indices, values.T, strict=True):
@@ -257,7 +262,7 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
     """Refuse a point in a number under a decimal comma:
     it may group thousands, or be decimal after all.
     """
-    if file.table.decimal != ",":
+    if file.layout.decimal != ",":
         return
     for number, row in enumerate(file.rows):
         if "." not in row:
@@ -266,7 +271,7 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
         for index in indices:
             if "." in fields[index]:
                 raise TableUnfit(
-                    file.place(number, index),
+                    file.field_place(number, index),
                     found=f"{fields[index]!r}, with a point",
                     expected="a number with a decimal comma alone, as `table` of the import "
                     "description has it",
@@ -287,7 +292,7 @@ def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
     if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():
         return
     texts = [file.fields(row)[index] for row in file.rows]
-    sign = re.escape(file.table.decimal)
+    sign = re.escape(file.layout.decimal)
     grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}")
     plain = re.compile(r"[-+]?\d{1,3}")
     first = next((number for number, text in enumerate(texts) if grouped.fullmatch(text)), None)
@@ -299,9 +304,9 @@ def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
     ):
         return
     raise TableUnfit(
-        file.place(first, index),
+        file.field_place(first, index),
         found=f"{texts[first]!r} beside {beside!r}: three digits behind every "
-        f"{file.table.decimal!r} of the column",
+        f"{file.layout.decimal!r} of the column",
         expected="numbers whose thousands are not grouped",
         remedy="export them without grouping; if these are decimals, export all numbers with the "
         "same three",
@@ -317,13 +322,13 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
         text: of the field.
         values: of the columns that are read, shape (k, n).
     """
-    if file.table.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
+    if file.layout.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
         if text[-4:-3] == ",":
             grouped = "; if commas group thousands, export the numbers without them"
         else:
             grouped = ""
         return 'write `decimal: ","` under `table` in the import description' + grouped
-    if row == 0 and not file.table.header:
+    if row == 0 and not file.layout.header:
         return (
             "if this line is a header, write `header: true` under `table` in the import description"
         )

@@ -30,7 +30,10 @@ class Topic:
 
     name: str  #: as publishers know it
     has_joint_states: bool  #: in CDR
-    publisher: str = ""  #: name of the node, where the bag has it (ROS 1)
+    #: name of the node, where the bag has it (ROS 1, or MCAP converted from it)
+    publisher: str = ""
+    #: among those of the same name in its file, from 1: a writer may give each publisher its own
+    channel: int = 1
 
 
 class BagMessage(NamedTuple):
@@ -93,9 +96,20 @@ class McapBag(RecordFile):
                 elif isinstance(record, Channel):
                     schema = self._schemas.get(record.schema_id)
                     is_joints = schema is not None and schema.name == JOINTS_SCHEMA
-                    self.topics[record.id] = Topic(
-                        record.topic, is_joints and record.message_encoding == "cdr"
-                    )
+                    has_joint_states = is_joints and record.message_encoding == "cdr"
+                    others = [
+                        number
+                        for number, topic in self.topics.items()
+                        if topic.name == record.topic
+                    ]
+                    known = self.topics.get(record.id)
+                    # The index at the end repeats the channels.
+                    if known is None:
+                        channel = len(others) + 1
+                    else:
+                        channel = known.channel
+                    node = record.metadata.get("callerid", "")
+                    self.topics[record.id] = Topic(record.topic, has_joint_states, node, channel)
 
     def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
         data = self.unpack(offset, chunk)

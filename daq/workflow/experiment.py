@@ -76,7 +76,7 @@ class CheckedScene:
         else:
             known = "as declared"
         shape = f"shape of the arm: {len(scene.capsules)} capsules, {known}"
-        if self.guessed and self.checker.robot.closures:
+        if self.guessed and self.checker.robot.is_constrained:
             shape = (
                 "shape of the links: unknown, of a closed chain it is not guessed; declare "
                 "`clearance` in the cell file"
@@ -154,7 +154,7 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
     those links get none. Neither do those of a closed chain, whose legs lie in front of and behind
     each other.
     """
-    if robot.closures:
+    if robot.is_constrained:
         return ()
     radius = LINK_RADIUS * max(
         sum(float(np.linalg.norm(joint.translation_m)) for joint in robot.joints), 0.1
@@ -369,7 +369,7 @@ def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
     """
     rng = np.random.default_rng(0)
     targets = rng.uniform(limits.lower, limits.upper, (40, len(limits.lower)))
-    if checker.robot.closures:
+    if checker.robot.is_constrained:
         targets = _allowed(checker, rng, limits.lower, limits.upper, len(targets))
     parts = []
     for start, end in pairwise(targets):
@@ -458,11 +458,14 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     limits = limits_of(cell)
     low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
-    if checker.robot.closures:
+    if checker.robot.is_constrained:
         sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    ends_of = _swing_of_chain if checker.robot.closures else _swing
+    if checker.robot.is_constrained:
+        ends_of = _swing_of_chain
+    else:
+        ends_of = _swing
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""

@@ -135,7 +135,7 @@ def _without_parameters(calibration: Calibration, names: Set[str]) -> Calibratio
 
 def _joint_of(place: int, robot: Robot) -> int | None:
     """Joint of a place of effects (`Robot.places`); None of a pivot that a loop is cut at."""
-    joints = (*robot.axis_joints, *robot.passive_joints)
+    joints = robot.place_joints
     return joints[place] if place < len(joints) else None
 
 

@@ -115,7 +115,7 @@ def write_mjcf(source: MjcfSource, closed_positions: FloatArray) -> Mjcf:
     open_closures = tuple(_add_closures(root, source, bodies, closed_positions))
     _add_tendons(root, source, terms)
     actuators = tuple(_add_actuators(root, source))
-    if robot.closures:
+    if robot.is_constrained:
         keyframe = SubElement(root, "keyframe")
         SubElement(keyframe, "key", name="assembly", qpos=_numbers(model.assembly.position_rad))
     left = [*source.remarks, *_describe_left(terms.left_over, open_closures, _units(source.gains))]
@@ -318,11 +318,21 @@ def _add_site(bodies: Sequence[Element], name: str, place: Place) -> None:
 def _add_closures(
     root: Element, source: MjcfSource, bodies: Sequence[Element], closed_positions: FloatArray
 ) -> Iterator[str]:
-    """Add a constraint for each closure, and return those that MuJoCo has none for."""
+    """Add a constraint for each follower and closure,
+    and return the closures that MuJoCo has none for.
+    """
     robot = source.model.robot
-    if not robot.closures:
+    if not robot.is_constrained:
         return
     equality = SubElement(root, "equality")
+    for coupling in robot.couplings:
+        SubElement(
+            equality,
+            "joint",
+            joint1=robot.joints[coupling.follower].name,
+            joint2=robot.joints[coupling.leader].name,
+            polycoef=_numbers((coupling.offset, coupling.multiplier, 0.0, 0.0, 0.0)),
+        )
     size_m = source.model.assembly.size_m
     for closure in robot.closures:
         holds = set(closure.directions)

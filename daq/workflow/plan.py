@@ -381,7 +381,7 @@ class Search:
         for _ in range(MAX_TRIES):
             move = self._random_move()
             checker = self._experiment.scene.checker
-            if checker.robot.closures:
+            if checker.robot.is_constrained:
                 near = towards(
                     checker, checker.home, np.array(move.target_rad), self._low, self._high
                 )
@@ -395,7 +395,7 @@ class Search:
             move = self._random_move()
             checker = self._experiment.scene.checker
             target = np.array(move.target_rad)
-            if checker.robot.closures:  # a way to a far target often leaves the workspace
+            if checker.robot.is_constrained:  # a way to a far target often leaves the workspace
                 target = towards(checker, start, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(target))
             if np.array_equal(target, start) or not self._is_within(move):

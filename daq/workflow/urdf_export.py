@@ -130,7 +130,7 @@ def random_states(model: Model, limits: FloatArray) -> Motion:
     Raises:
         ModelError: the loops of a closed chain close in no such range.
     """
-    if not model.robot.closures:
+    if not model.robot.is_constrained:
         return random_motion(limits, SAMPLES, SEED)
     leading, robot, assembly = _leading_motors(model)
     failure: ModelError | None = None

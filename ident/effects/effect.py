@@ -579,7 +579,7 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False
-    if effect.needs_tree and robot.closures:
+    if effect.needs_tree and robot.is_constrained:
         return False
     if not effect.has_axis:
         return axis == 0

@@ -316,7 +316,7 @@ def declared_signals(
     position = motion.position_rad
     velocity = motion.velocity_rad_s
     acceleration = motion.acceleration_rad_s2
-    if model.robot.closures:
+    if model.robot.undriven_names:
         followed = model.follow(motion)
         placed = model.at_places(followed)
         position = placed.position_rad

@@ -7,8 +7,10 @@ Every loop is cut, so that a tree with n joints remains, and closed again by φ(
 
 x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x
 in the others. With as many motors as degrees of freedom (m = d), x are the motors' joints, and A =
-I. A robot without closures has G = A = I. (Briot & Gautier, Multibody System Dynamics 2015, eqs. of
-the tree and its closure; Khalil & Dombre, Modeling, Identification and Control of Robots, ch. 7.)
+I. A joint that follows another in a fixed ratio is a row of φ, too: G then has that ratio. A robot
+without closures and followers has G = A = I. (Briot & Gautier, Multibody System Dynamics 2015, eqs.
+of the tree and its closure; Khalil & Dombre, Modeling, Identification and Control of Robots, ch.
+7.)
 
 Rows of φ that are lengths are divided by the size of the robot: a condition number then compares
 like with like.
@@ -22,7 +24,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.errors import ModelError
-from ident.model.closures import loops, origin
+from ident.model.closures import loops, origin, with_followers
 from ident.model.robot import JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
@@ -82,7 +84,7 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     """Close the loops at the assembly pose, and count what remains free.
 
     Args:
-        robot: with closures; a robot without any has n independent joints.
+        robot: with closures or couplings; a robot without any has n independent joints.
         mobility: d as its maker declares it; not checked when None.
 
     Raises:
@@ -95,9 +97,10 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
         start = np.zeros(count)
     else:
         start = np.asarray(robot.assembly_rad, dtype=np.float64)
-    if not robot.closures:
+    if not robot.is_constrained:
         return Assembly(start, everything, (), _size(robot, start), 1.0)
     _check(robot, start)
+    start = with_followers(robot, start)
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
     jacobian = loops(robot, position[None], size_m).jacobian[0]
@@ -167,7 +170,7 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     samples = len(measured)
     count = robot.joint_count
     d = len(x)
-    if not robot.closures:
+    if not robot.is_constrained:
         one = np.broadcast_to(np.eye(count), (samples, count, count))
         return TreeMotion(axes, one, one, np.ones(samples))
     position = positions(robot, assembly, measured)
@@ -285,7 +288,7 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     """
     samples = len(axes_rad)
     motors = list(robot.axis_joints)
-    if not robot.closures:
+    if not robot.is_constrained:
         return Reach(axes_rad, np.zeros(samples), np.zeros(samples), np.ones(samples))
     start = assembly.position_rad[motors]
     units = _units(robot, assembly)
@@ -355,6 +358,7 @@ def _newton(
     redundant = len(motors) > len(x)
     if not redundant:
         position[:, motors] = axes_rad
+    position = with_followers(robot, position)
     for _ in range(MAX_ITERATIONS):
         closing = loops(robot, position, assembly.size_m)
         gap = np.max(np.abs(closing.residual), axis=1)
@@ -484,7 +488,8 @@ def _check(robot: Robot, start: FloatArray) -> None:
         )
     if not robot.motors:
         raise ModelError(
-            "a robot with closures needs the list of its motors' joints (`motors`); found none"
+            "a robot with closures or couplings needs the list of its motors' joints (`motors`); "
+            "found none"
         )
     if len(set(robot.motors)) < len(robot.motors):
         twice = (
@@ -495,6 +500,14 @@ def _check(robot: Robot, start: FloatArray) -> None:
         raise ModelError(
             f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)"
         )
+    for coupling in robot.couplings:
+        if coupling.follower in robot.motors:
+            name = robot.joints[coupling.follower].name
+            leader = robot.joints[coupling.leader].name
+            raise ModelError(
+                f"joint {name!r} follows {leader!r} and has a motor; expected one or the other "
+                "(`motors`)"
+            )
     for joint, position in zip(robot.joints, start, strict=True):
         # Poses are reached from the assembly pose in small steps, so a turn too many costs time in
         # each of them.

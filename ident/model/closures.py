@@ -2,7 +2,8 @@
 and the derivatives of that.
 
 A closure says that two frames of the tree coincide in some directions of the first
-(`ident.model.robot.Closure`).
+(`ident.model.robot.Closure`). A joint that follows another one adds a row, φ = q − multiplier ·
+q_leader − offset (`ident.model.robot.JointCoupling`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _INDEX = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loops:
-    """φ, J and J̇ q̇ of all closures over k samples."""
+    """φ, J and J̇ q̇ of all closures, then of all couplings, over k samples."""
 
     residual: FloatArray  #: shape (k, c)
     jacobian: FloatArray  #: shape (k, c, n)
@@ -33,7 +34,7 @@ def loops(
     """φ, J and J̇ q̇ with lengths divided by the size of the robot.
 
     Args:
-        robot: with closures.
+        robot: with closures or couplings.
         position, velocity: of all joints [rad or m, and per s], shape (k, n); without velocities J̇
             q̇ is empty.
         size_m: that divides lengths.
@@ -47,7 +48,7 @@ def loops(
         moved = None
     else:
         moved = _spin(robot, placed, axes, position, velocity)
-    width = sum(len(closure.directions) for closure in robot.closures)
+    width = sum(len(closure.directions) for closure in robot.closures) + len(robot.couplings)
     residual = np.empty((samples, width))
     jacobian = np.empty((samples, width, robot.joint_count))
     bias = np.empty((samples, width if moved is not None else 0))
@@ -63,7 +64,31 @@ def loops(
         for array in (residual, jacobian, bias) if moved is not None else (residual, jacobian):
             array[:, lengths] /= size_m
         first = part.stop
+    for row, coupling in enumerate(robot.couplings, start=first):
+        if robot.joints[coupling.follower].kind is JointKind.REVOLUTE:
+            unit = 1.0
+        else:
+            unit = size_m
+        followed = coupling.multiplier * position[:, coupling.leader] + coupling.offset
+        residual[:, row] = (position[:, coupling.follower] - followed) / unit
+        jacobian[:, row] = 0.0
+        jacobian[:, row, coupling.follower] = 1.0 / unit
+        jacobian[:, row, coupling.leader] = -coupling.multiplier / unit
+        if moved is not None:
+            bias[:, row] = 0.0
     return Loops(residual, jacobian, bias)
+
+
+def with_followers(robot: Robot, position: FloatArray) -> FloatArray:
+    """Positions of all joints [rad or m], shape (…, n),
+    with each follower where its leader puts it.
+    """
+    out = position.copy()
+    for coupling in robot.couplings:
+        out[..., coupling.follower] = (
+            coupling.multiplier * position[..., coupling.leader] + coupling.offset
+        )
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

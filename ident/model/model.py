@@ -265,10 +265,10 @@ class Model:
             first = JOINT_COLUMNS * link
             joint = link
             # A link loads its own joint and those before it
-            while joint >= 0 and not self.robot.closures:
+            while joint >= 0 and not self.robot.is_constrained:
                 out[joint, first : first + 10] = True
                 joint = self.robot.joints[joint].parent
-            if self.robot.closures:
+            if self.robot.is_constrained:
                 out[:, first : first + 10] = True
         for index, motor in enumerate(self.drive_train.coupled):
             first = JOINT_COLUMNS * count + 3 * index
@@ -291,7 +291,7 @@ class Model:
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return self._tree_regressor(*self._joint_first(motion), loaded=loaded)
         columns, to_motors = self.balance(motion, loaded=loaded)
         if self.is_redundant:
@@ -323,7 +323,7 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         states = self._joint_first(motion)
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return follow(self.robot, self.assembly, motion)
         digest = blake2b(b"".join(state.tobytes() for state in states)).digest()
         # Replaced as a whole: of two threads, one may lose what the other has added, but neither
@@ -411,7 +411,10 @@ class Model:
             -1, 3, 1
         )
         own = links[list(self.robot.axis_joints)]
-        followed = self.follow(motion) if self.robot.closures else None
+        if self.robot.is_constrained:
+            followed = self.follow(motion)
+        else:
+            followed = None
         if followed is None:
             load = rigid_torque(self.robot, position, velocity, acceleration, links[:, :10])
         else:
@@ -447,7 +450,7 @@ class Model:
             ModelError: the loops cannot be closed.
         """
         links = standard[self.link_columns]
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return mass_matrix(self.robot, np.ascontiguousarray(position_rad.T), links)
         still = np.zeros_like(position_rad)
         followed = self.follow(Motion(position_rad, still, still))
@@ -460,7 +463,9 @@ class Model:
         """Torque at each axis per unit of torque on each place without a motor (`Robot.places`),
         shape (u, m, k).
         """
-        unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
+        unit = np.eye(self.robot.joint_count)[
+            :, list(self.robot.place_joints[self.robot.axis_count :])
+        ]
         torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
         per_joint = pivot_rates(self.robot, followed.joints.position_rad)
         torque = np.concatenate((torque, np.transpose(per_joint, (2, 1, 0))), axis=1)
@@ -470,7 +475,7 @@ class Model:
         """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k,
         places).
         """
-        joints = [*self.robot.axis_joints, *self.robot.passive_joints]
+        joints = list(self.robot.place_joints)
         tree = followed.joints
         pivots = pivot_motion(self.robot, self.assembly, tree)
         return Motion(

@@ -64,6 +64,18 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True)
+class JointCoupling:
+    """A joint without a motor that follows another one by a gear or a linkage:
+    q = multiplier · q_leader + offset.
+    """
+
+    follower: int  #: index of the joint that follows
+    leader: int  #: index of the joint that it follows, which follows none itself
+    multiplier: float  #: [rad or m of the follower, per rad or m of the leader]
+    offset: float  #: position of the follower where the leader is at zero [rad or m]
+
+
+@dataclass(frozen=True, slots=True)
 class Pivot:
     """A joint at which a loop is cut, and that turns about one axis; see `ident.model.pivots`."""
 
@@ -75,6 +87,8 @@ class Pivot:
 class Robot:
     """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a
     motor.
+
+    Joints without a motor may also follow others in a fixed ratio (`couplings`).
     """
 
     joints: tuple[Joint, ...]  #: depth first from the base
@@ -93,6 +107,13 @@ class Robot:
     #: Joints at which loops are cut, without those in which friction is the same as in a joint of
     #: the tree.
     pivots: tuple[Pivot, ...] = ()
+    #: Joints that follow another one in a fixed ratio (`<mimic>` of a URDF).
+    couplings: tuple[JointCoupling, ...] = ()
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether joints depend on each other: loops close, or joints follow others."""
+        return bool(self.closures or self.couplings)
 
     @property
     def joint_count(self) -> int:
@@ -129,12 +150,23 @@ class Robot:
         return tuple(joint for joint in range(len(self.joints)) if joint not in self.axis_joints)
 
     @property
+    def place_joints(self) -> tuple[int, ...]:
+        """Joints at which an effect can act: those of the axes, then those without a motor.
+
+        A follower is none: it turns as its leader does, so friction or a spring in it is one in its
+            leader.
+        """
+        followers = {coupling.follower for coupling in self.couplings}
+        passive = (joint for joint in self.passive_joints if joint not in followers)
+        return (*self.axis_joints, *passive)
+
+    @property
     def places(self) -> tuple[Joint, ...]:
-        """Where an effect can act: the driven joints, those without a motor,
+        """Where an effect can act: the joints of `place_joints`,
         and the pivots that loops are cut at.
         """
-        passive = (self.joints[joint] for joint in self.passive_joints)
-        return (*self.axes, *passive, *map(self._as_joint, self.pivots))
+        joints = (self.joints[joint] for joint in self.place_joints)
+        return (*joints, *map(self._as_joint, self.pivots))
 
     def _as_joint(self, pivot: Pivot) -> Joint:
         closure = self.closures[pivot.closure]
@@ -161,7 +193,7 @@ class Robot:
     @property
     def undriven_names(self) -> tuple[str, ...]:
         """Names of the places without a motor, in the order of `places`."""
-        return (*self.passive_names, *self.pivot_names)
+        return tuple(place.name for place in self.places[self.axis_count :])
 
     @property
     def axis_count(self) -> int:

@@ -46,7 +46,7 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
     compared = [name for name in names if not name.split(" ", 1)[0].endswith(LOADED)]
     # Standard parameters as they are, none gathered with others, are right for their robot.
     is_grouped = any(TERM.search(name) for name in compared)
-    if model.robot.closures or not is_grouped:
+    if model.robot.is_constrained or not is_grouped:
         return None
     kept = [
         number for number, column in enumerate(model.columns) if not column.name.endswith(LOADED)

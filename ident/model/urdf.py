@@ -20,16 +20,20 @@ from ident.arrays import FloatArray, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.pivots import cut_pivots
-from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robot, poses
+from ident.model.robot import (
+    DIRECTIONS,
+    Closure,
+    Joint,
+    JointCoupling,
+    JointKind,
+    Place,
+    Robot,
+    poses,
+)
 
 HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
-LINKAGE = (
-    "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and "
-    "`motors`, as of a closed chain (of a parallelogram, the link behind it keeps the direction of "
-    "the link before its leader: one closure of the two links about the joints' axis); a gear or "
-    "belt of another ratio between joints is not supported"
-)
-"""What to do about a joint that follows an axis."""
+FOLLOWS_BY_ITSELF = "no `hold` of it: a joint that mimics an axis is read as one that follows it"
+"""What to do about a held joint that follows an axis."""
 XACRO_SPACES = (
     "{http://www.ros.org/wiki/xacro}",
     "{http://ros.org/wiki/xacro}",
@@ -78,25 +82,33 @@ def robot_from_urdf(
 ) -> Robot:
     """Read the kinematic tree of a URDF, and close its loops.
 
+    A joint with `<mimic>` is no axis: it follows the joint that it names, and what its link weighs
+    loads that axis.
+
     Args:
         urdf: text of the URDF; fixed joints are merged into their parents, inertias are not used.
         gravity_m_s2: gravity in the base frame.
         closures: which links coincide; none of a serial robot.
-        motors: joint of each axis of a closed chain, in the order of the axes.
+        motors: joint of each axis of a closed chain, in the order of the axes. Without closures,
+            every joint that follows none has a motor.
         assembly_rad: roughly, the position of every joint at which the closures hold [rad; m of a
             prismatic joint]; joints that are not named are at 0.
         platform: link that carries the payload; that of the last joint when None.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, one of more than one degree of
-            freedom, or one that mimics another (`hold_joints` fixes those of a gripper with their
-            leader); a closure, motor, assembly pose or platform names what it does not have.
+        ModelError: the text is no URDF, has no moving joint, or one of more than one degree of
+            freedom; a closure, motor, assembly pose or platform names what it does not have; a
+            joint mimics one that does not move, or itself, or is in a closed chain.
     """
     found = read_urdf(urdf)
-    for name, mimic in mimics_of(urdf).items():
-        followed = f"joint {mimic.leader!r} (multiplier {mimic.multiplier:g})"
-        raise ModelError(f"joint {name!r} mimics {followed}; expected {LINKAGE}")
     index = {joint.name: number for number, joint in enumerate(found.joints)}
+    couplings = _couplings(mimics_of(urdf), index)
+    if couplings and closures:
+        follower = found.joints[couplings[0].follower].name
+        raise ModelError(
+            f"joint {follower!r} has <mimic>, and the robot has closures; expected one of the two: "
+            "delete <mimic>, and describe what couples the joint as a closure"
+        )
 
     def link(name: str, what: str) -> Place:
         if name not in found.links:
@@ -143,13 +155,18 @@ def robot_from_urdf(
             f"the platform {platform!r} does not move; expected the link that carries the payload"
         )
     pose = np.array([(assembly_rad or {}).get(joint.name, 0.0) for joint in found.joints])
+    driven = tuple(index[name] for name in motors)
+    if couplings and not driven:
+        followers = {coupling.follower for coupling in couplings}
+        driven = tuple(number for number in index.values() if number not in followers)
     robot = Robot(
         joints=found.joints,
         gravity_m_s2=np.asarray(gravity_m_s2, dtype=np.float64),
         closures=tuple(closed),
-        motors=tuple(index[name] for name in motors),
-        assembly_rad=pose if closed else None,
+        motors=driven,
+        assembly_rad=pose if closed or couplings else None,
         platform=carrier,
+        couplings=couplings,
     )
     if closed:
         return replace(robot, pivots=cut_pivots(robot))
@@ -215,6 +232,49 @@ def _movable(robot: Element) -> dict[str, Element]:
     return {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
 
 
+def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
+    """Return how a joint follows the joint at the head of its chain of followers.
+
+    Args:
+        name: of a joint that mimics another one.
+        mimics: of the URDF (`mimics_of`).
+
+    Raises:
+        ModelError: the chain leads back to one of its joints.
+    """
+    seen = {name}
+    found = mimics[name]
+    while found.leader in mimics:
+        if found.leader in seen:
+            raise ModelError(
+                f"joint {name!r} mimics {mimics[name].leader!r}, which follows it in turn; "
+                "expected a joint at the head that mimics none"
+            )
+        seen.add(found.leader)
+        before = mimics[found.leader]
+        # q = a (b q_leader + c) + d
+        offset = found.multiplier * before.offset + found.offset
+        found = Mimic(before.leader, found.multiplier * before.multiplier, offset)
+    return found
+
+
+def _couplings(mimics: Mapping[str, Mimic], index: Mapping[str, int]) -> tuple[JointCoupling, ...]:
+    """Return how each follower depends on a joint that follows none."""
+    found = []
+    for name in mimics:
+        mimic = first_leader(name, mimics)
+        if mimic.leader not in index:
+            moving = ", ".join(joint for joint in index if joint not in mimics) or "none"
+            raise ModelError(
+                f"joint {name!r} mimics {mimic.leader!r}, which is no joint of the URDF that "
+                f"moves; expected one of {moving}; hold {name!r} where it stays (`hold_joints`)"
+            )
+        found.append(
+            JointCoupling(index[name], index[mimic.leader], mimic.multiplier, mimic.offset)
+        )
+    return tuple(found)
+
+
 def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
     found = {}
     for name, joint in movable.items():
@@ -266,7 +326,7 @@ def _require_free(
     elif mimic.leader in movable:
         raise ModelError(
             f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), "
-            f"which moves: it follows and cannot be held; expected {LINKAGE}"
+            f"which moves: it follows and cannot be held; expected {FOLLOWS_BY_ITSELF}"
         )
 
 

@@ -320,10 +320,10 @@ def _solved(equations: _Equations, first: int) -> _Solution:
 
 def _require_full(system: System, prior: LinkPrior) -> None:
     robot = system.model.robot
-    if robot.closures:
+    if robot.is_constrained:
         raise ModelError(
-            "the robot has a closed chain; expected a serial robot, each joint with a motor: for "
-            "the links of a loop no masses are computed"
+            "the robot has a closed chain, or joints that follow others; expected a serial robot, "
+            "each joint with a motor: for links that move together no masses are computed"
         )
     if len(prior.links) != robot.joint_count:
         raise ModelError(

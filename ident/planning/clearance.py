@@ -141,7 +141,7 @@ class Checker:
             shape (k,); inf where there is nothing to keep away from, −inf where the loops of a
             closed chain do not close, or nearly have a singularity.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return np.asarray(self._margins(position, self._everywhere).min(axis=0, initial=np.inf))
         found = self._reached(position)
         return np.where(
@@ -154,7 +154,7 @@ class Checker:
         """Positions of the axes that fit each other, near given ones, shape (…, m):
         the same where they are free.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return position
         found = reach(self.robot, self._assembly, np.atleast_2d(position)).position_rad
         return found[:, list(self.robot.axis_joints)].reshape(position.shape)
@@ -181,7 +181,7 @@ class Checker:
         """Share of postures, shape (k, n), in which each of the scene's pairs does not touch,
         shape (pairs,).
         """
-        if self.robot.closures:
+        if self.robot.is_constrained:
             found = self._reached(position)
             position = found.joints[found.usable]
         margins = self._margins(position, self._everywhere)[: len(self.scene.pairs)]
@@ -193,7 +193,7 @@ class Checker:
         Args:
             start, end: positions of the axes [rad or m], shape (m,).
         """
-        if self.robot.closures:
+        if self.robot.is_constrained:
             return self._ways(start[None], end[None])[0]
         # A bound on the path of any point of one body relative to the other, for each row of
         # `_margins` [m].
@@ -235,7 +235,7 @@ class Checker:
         """
         ends = self.fitting(ends)
         inside = np.all((ends >= lower) & (ends <= upper), axis=1)
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return next((end for end in ends[inside] if self.obstruction(start, end) is None), None)
         found = self._ways(np.broadcast_to(start, ends.shape), ends)
         clear = (

@@ -278,9 +278,10 @@ def plan_moves(
         require_kind("urdf", urdf, str, "give the text of the file: Path(...).read_text()")
     if conditioning is not None:
         require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
-    if model.robot.closures:
+    if model.robot.is_constrained:
         raise ModelError(
-            "the model is of a closed chain, whose reach is not known here; expected a serial robot"
+            "the model is of a closed chain, or has joints that follow others: its reach is not "
+            "known here; expected a serial robot, each joint with a motor"
         )
     count = model.robot.axis_count
     gains = as_array("nameplate", nameplate, (count,), "one per motor")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.config.cell import PacingMode, model_of
+from daq.config.cell import PacingMode, joint_names, model_of
 from daq.config.cell_buses import bus_address, bus_parts, cell_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
@@ -633,13 +633,36 @@ FOLLOWER = """
 </robot>"""  # noqa: E501
 
 
-@pytest.mark.parametrize("hold", ["", "hold: {rod: 0.0}"], ids=["not held", "held"])
-@pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
-def test_a_joint_that_follows_an_axis_cannot_be_held(
-    configurations: Path, hold: str, logged: bool
-) -> None:
+def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
     _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
-    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", f"\n{hold}\naxes:")
+    cell = load_cell(configurations / "cells/tx40.yaml")
+    model = model_of(cell)
+    assert cell.place_names == cell.axis_names
+    assert [joint.name for joint in model.robot.places] == [
+        joint.name for joint in model.robot.axes
+    ]
+    assert joint_names(cell) == ("J1", "J2", "J3", "J4", "J5", "J6")
+    (coupling,) = model.robot.couplings
+    assert model.robot.joints[coupling.follower].name == "rod"
+    assert model.robot.joints[coupling.leader].name == "J5"
+    assert coupling.multiplier == -1.0
+
+
+def test_a_body_on_a_joint_that_follows_may_be_named(configurations: Path) -> None:
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    capsule = "{name: rod, link: rod, from_m: [0, 0, 0], to_m: [0, 0, 0.1], radius_m: 0.02}"
+    declared = f"\nclearance: {{capsules: [{capsule}]}}\naxes:"
+    cell = load_cell(_spoil(configurations / "cells/tx40.yaml", "\naxes:", declared))
+    assert cell.clearance is not None
+    (body,) = cell.clearance.capsules
+    assert body.name == "rod"
+    assert body.link == 6
+
+
+@pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
+def test_a_joint_that_follows_an_axis_cannot_be_held(configurations: Path, logged: bool) -> None:
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", "\nhold: {rod: 0.0}\naxes:")
     with pytest.raises(
         ConfigurationInconsistent,
         match=r"joint '?rod'? mimics .*J5.* "
@@ -649,8 +672,7 @@ def test_a_joint_that_follows_an_axis_cannot_be_held(
             cell_from_bundle(bundle(cell))
         else:
             load_cell(cell)
-    assert "`closures`" in str(refused.value)
-    assert "`hold` of" not in str(refused.value)
+    assert "no `hold` of it" in str(refused.value)
     assert "hold: {" not in str(refused.value)
 
 

@@ -20,7 +20,16 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
 from daq.cli import main
-from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
+from daq.config.import_description import (
+    CurrentColumns,
+    ImportDescription,
+    KeptPart,
+    PositionColumns,
+    PositionUnit,
+    Side,
+    TimeColumn,
+    TimeUnit,
+)
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
 from daq.log.bag_table import STAMP, interleaved, read_bag
 from daq.log.conversion import load_run
@@ -67,7 +76,9 @@ def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **opti
 
 def describe(topic: str | None = None, **changes: Any) -> ImportDescription:
     """A description, with what the reader needs of it alone."""
-    return ImportDescription.model_construct(topic=topic, **changes)
+    return ImportDescription.model_construct(
+        **{"topic": topic, "position": None, "current": None} | changes
+    )
 
 
 def read(
@@ -264,6 +275,79 @@ def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) 
         read(bag, publisher=2)
 
 
+def _of_sections(position: dict[str, Any], current: dict[str, Any]) -> dict[str, Any]:
+    """Sections whose positions and efforts have a topic or a publisher of their own."""
+    columns = COLUMNS[:6]
+    moved = PositionColumns(
+        file="run.mcap", columns=columns, unit=PositionUnit.RAD, side=Side.JOINT, **position
+    )
+    return {
+        "position": moved,
+        "current": CurrentColumns(file="run.mcap", columns=COLUMNS[6:], unit="A", **current),
+    }
+
+
+def _apart(
+    effort_topic: str, *, effort_rows: Sequence[int] = range(ROWS)
+) -> list[tuple[str, dict[str, Any]]]:
+    """Positions in messages of their own, and efforts in others."""
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row, effort=[])))
+        if row in effort_rows:
+            parts.append((effort_topic, message(row, position=[])))
+    return parts
+
+
+@pytest.mark.parametrize(
+    ("topic", "position", "current"),
+    [
+        ("/efforts", {"topic": "/joint_states"}, {"topic": "/efforts"}),
+        ("/joint_states", {"publisher": 1}, {"publisher": 2}),
+    ],
+    ids=["two topics", "two publishers of a topic"],
+)
+def test_positions_and_efforts_of_different_messages_are_joined_by_their_stamps(
+    topic: str, position: dict[str, Any], current: dict[str, Any], tmp_path: Path
+) -> None:
+    sections = _of_sections(position, current)
+    bag = write_bag(tmp_path / "run.mcap", _apart(topic))
+    assert_whole(read(bag, **sections))
+    # Beginning and end are those of the shorter one.
+    bag = write_bag(tmp_path / "run.mcap", _apart(topic, effort_rows=range(10, ROWS - 20)))
+    table = read(bag, **sections)
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[10:-20])
+    assert table.stamps is not None
+    assert table.stamps.first_ns == START_NS + 10 * STEP_NS
+    assert any(
+        "left out, as other columns have none there: 30 stamps of /joint_states" in one
+        or "30 stamps of the topic (publisher 1)" in one
+        for one in table.remarks
+    )
+    part = read(bag, keep=KeptPart(from_row=3, to_row=52), **sections)
+    np.testing.assert_array_equal(part.values, table.values[2:52])
+    assert part.first_row == 2
+
+
+def test_messages_that_cannot_be_joined_are_named_with_their_rates(tmp_path: Path) -> None:
+    sections = _of_sections({"topic": "/joint_states"}, {"topic": "/efforts"})
+    bag = write_bag(tmp_path / "run.mcap", _apart("/efforts", effort_rows=range(0, ROWS, 2)))
+    with pytest.raises(TableUnfit) as caught:
+        read(bag, **sections)
+    rates = (
+        "200 stamps each 0.004 s on /joint_states and 100 stamps each 0.008 s on /efforts, 100 of "
+        "them the same"
+    )
+    assert caught.value.found == rates
+    assert "nothing is interpolated between messages" in caught.value.remedy
+    with pytest.raises(TableUnfit, match="`topic` under `position` and `current`"):
+        read(bag)
+    with pytest.raises(
+        TableUnfit, match="found topics /joint_states, /efforts; expected /absent of type"
+    ):
+        read(bag, **_of_sections({"topic": "/joint_states"}, {"topic": "/absent"}))
+
+
 @pytest.mark.parametrize("publisher", [None, 1])
 def test_positions_and_efforts_in_separate_messages_have_a_way(
     publisher: int | None, tmp_path: Path
@@ -273,8 +357,11 @@ def test_positions_and_efforts_in_separate_messages_have_a_way(
         parts.append(("/joint_states", message(row, effort=[])))
         parts.append(("/joint_states", message(row, position=[])))
     bag = write_bag(tmp_path / "run.mcap", parts)
-    with pytest.raises(TableUnfit, match="write each field to a CSV file"):
+    with pytest.raises(TableUnfit, match="write each field to a CSV file") as caught:
         read(bag, publisher=publisher)
+    assert (
+        "`position: {..., publisher: 1}` and `current: {..., publisher: 2}`"
+    ) in caught.value.remedy
 
 
 def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
@@ -302,6 +389,88 @@ def test_two_publishers_with_nothing_but_other_stamps_are_refused(
     assert f"{ROWS} messages each 0.004 s" in caught.value.found
     assert f"{ROWS // every} messages each {0.004 * every:g} s" in caught.value.found
     assert "`frame_id`" in caught.value.remedy
+    assert "`rhythm: 1`" in caught.value.remedy
+    first = read(bag, rhythm=1)
+    assert_whole(first)
+    second = read(bag, rhythm=2)
+    np.testing.assert_array_equal(second.values, np.hstack((POSITION, EFFORT))[::every])
+    assert second.stamps is not None
+    assert second.stamps.first_ns == START_NS + later_ns
+
+
+def test_a_rhythm_is_chosen_only_where_each_message_has_one(tmp_path: Path) -> None:
+    with pytest.raises(
+        TableUnfit,
+        match=r"found `rhythm: 2`, and no two even rows of stamps; .* "
+        r"leave `rhythm` out",
+    ):
+        read(write_bag(tmp_path / "run.mcap", whole()), rhythm=2)
+    lost = [one for number, one in enumerate(_alike(1, 1_300_000)) if number != 2 * ROWS - 21]
+    with pytest.raises(
+        TableUnfit,
+        match=r"found `rhythm: 1`, and (stamps of two publishers with "
+        r"steps|no two even)",
+    ):
+        read(write_bag(tmp_path / "run.mcap", lost), rhythm=1)
+
+
+def _write_channels(
+    path: Path, parts: Iterable[tuple[int, dict[str, Any]]], nodes: Sequence[str] = ("", "")
+) -> Path:
+    """A bag in which two channels have one topic, with the names of their nodes."""
+    source = write_bag(
+        path.with_suffix(".source"), [(f"/{number}", content) for number, content in parts]
+    )
+    with source.open("rb") as read_from, path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        channels: dict[str, int] = {}
+        for schema, channel, content in make_reader(read_from).iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                node = nodes[int(channel.topic[1:])]
+                metadata = {"callerid": node} if node else {}
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    "/joint_states", "cdr", number, metadata
+                )
+            writer.add_message(
+                channels[channel.topic], content.log_time, content.data, content.publish_time
+            )
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("nodes", "named"),
+    [
+        (
+            ("", ""),
+            r"2: channel 2, position "
+            r"and effort",
+        ),
+        (("/arm", "/fake"), r"1: /arm, .*; 2: /fake, channel 2, "),
+    ],
+)
+def test_publishers_with_a_channel_each_are_named_and_chosen(
+    nodes: Sequence[str], named: str, tmp_path: Path
+) -> None:
+    """Frame, joints and fields are the same."""
+    parts = []
+    for row in range(ROWS):
+        parts.append((0, message(row)))
+        parts.append((1, message(row, position=[0.0] * 6)))
+    bag = _write_channels(tmp_path / "run.mcap", parts, nodes)
+    with pytest.raises(TableUnfit, match=named):
+        read(bag)
+    assert_whole(read(bag, publisher=1))
+    assert not read(bag, publisher=2).values[:, :6].any()
+
+
+def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
+    """A recorder that is set up anew in one file gives the topic another channel."""
+    parts = [(int(row >= ROWS // 2), message(row)) for row in range(ROWS)]
+    assert_whole(read(_write_channels(tmp_path / "run.mcap", parts)))
 
 
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])

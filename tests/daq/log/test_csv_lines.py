@@ -130,6 +130,56 @@ def test_a_unit_in_the_name_of_a_column_is_compared_too(
     assert "in the name of the column" in caught.value.found
 
 
+def test_a_line_of_units_is_known_by_that_of_the_time_alone(tmp_path: Path) -> None:
+    table = _read(tmp_path, ["t,q,i", "s,rounds,bits", *ROWS])
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.remarks == (
+        "run.csv: line 2 was taken for the units of the columns: 's,rounds,bits'",
+    )
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column t: found unit 'ms' in the "
+        r"line of units",
+    ):
+        _read(tmp_path, ["t,q,i", "ms,rounds,bits", *ROWS])
+
+
+def test_a_unit_in_a_name_must_be_that_of_the_line_of_units(tmp_path: Path) -> None:
+    columns = ("q [deg]", "i [A]")
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column q \[deg\]: .* 'rad' .* and 'deg' in the name "
+        r".* one unit",
+    ):
+        _read(tmp_path, ["t,q [deg],i [A]", "s,rad,A", *ROWS], columns=columns)
+    # Letters that may be no unit, and units that say the same.
+    columns = ("q [A]", "i [Arms]")
+    assert (
+        len(_read(tmp_path, ["t,q [A],i [Arms]", "s,rad,A", *ROWS], columns=columns).values)
+        == COUNT
+    )
+
+
+def test_lines_count_as_an_editor_counts_them(tmp_path: Path) -> None:
+    """A form feed and a line separator of Unicode end no line."""
+    lines = ["exported\x0cby\u2028hand", "t,q,i", "s,rad,A", *ROWS, "0.2,word,1.0", *ROWS[:1]]
+    with pytest.raises(TableUnfit, match=rf"run\.csv:{4 + COUNT}, column q: found 'word'"):
+        _read(tmp_path, lines, skip_rows=1)
+    with pytest.raises(TableUnfit, match=r"run\.csv:3, column q: found unit 'deg'"):
+        _read(tmp_path, [*lines[:2], "s,deg,A", *ROWS], skip_rows=1)
+
+
+def test_a_header_of_numbers_is_named_by_its_line_where_units_follow(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2: found a header of numbers, 3, 7, 4"):
+        _read(
+            tmp_path,
+            ["exported by X", "3,7,4", "s,rad,A", *ROWS],
+            stamps="3",
+            columns=("7", "4"),
+            skip_rows=1,
+        )
+
+
 @pytest.mark.parametrize("unit", ["deg/s", "rpm", "mm/s"])
 def test_velocities_in_another_unit_are_refused(tmp_path: Path, unit: str) -> None:
     rows = [f"{row},0.5" for row in ROWS]

@@ -82,6 +82,11 @@ def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> No
         (_text(*ROWS, header="a,b").encode("utf-16-le"), "byte 1 is NUL"),
         (b"\xff\xfe" + _text(*ROWS).encode("utf-16-le")[:-1], "no UTF-16"),
         (b"a,b\n\x81\x8d,1\n", "byte 4 is no UTF-8"),
+        ("\u03b1,b\n1,\0\n".encode(), "byte 7 is NUL"),
+        ("\u03b1,b\n1,\0\n".encode("utf-8-sig"), "byte 10 is NUL"),
+        (b"\xef\xbb\xbfa,b\n\xe9,1\n", "byte 7 is no UTF-8"),
+        (b"\xff\xfe" + "a,b\n1,\0\n".encode("utf-16-le"), "byte 14 is NUL"),
+        (b"\xfe\xff" + "\U0001f916,b\n1,\0\n".encode("utf-16-be"), "byte 16 is NUL"),
     ],
 )
 def test_what_is_no_text(tmp_path: Path, data: bytes, found: str) -> None:

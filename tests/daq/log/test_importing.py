@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
+from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
@@ -31,6 +32,7 @@ from daq.report.document import json_tree
 from daq.report.log import info_report
 from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
+from ident.model.robot import Motion
 from tests.studies.real_runs import ur10
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -162,6 +164,24 @@ def test_column_numbers_semicolons_and_decimal_commas(bench: Bench) -> None:
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
     assert run.payload is not None
     assert run.payload.known == {"m": 4.59}
+
+
+def test_a_robot_with_a_joint_that_follows_an_axis_is_imported_by_its_axes(bench: Bench) -> None:
+    urdf = bench.folder / "configs/robots/tx40.urdf"
+    follower = """<link name="behind"/><joint name="rod" type="revolute"><origin xyz="0 0 0.1"/>
+      <parent link="link6"/><child link="behind"/><axis xyz="0 1 0"/>
+      <limit lower="-9" upper="9" velocity="1" effort="1"/>
+      <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
+    text = urdf.read_text(encoding="utf-8")
+    urdf.write_text(text.replace("</robot>", follower), encoding="utf-8")
+    assert bench.run() == 0
+    run, cell = load_run(bench.out)
+    still = np.zeros_like(run.position_rad)
+    joints = model_of(cell).follow(Motion(run.position_rad, still, still)).joints
+    np.testing.assert_allclose(joints.position_rad[:, :6], np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(
+        joints.position_rad[:, 6], 0.1 - 0.5 * np.radians(bench.joint_deg[:, 4]), atol=2e-9
+    )
 
 
 def test_the_same_files_give_the_same_log(bench: Bench) -> None:

@@ -317,6 +317,39 @@ def test_a_simulated_closed_chain_stays_closed(
     assert apart_m > 10.0 * gap_m
 
 
+def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = CHECKOUT / "configs"
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    rod = """<link name="behind"><inertial><origin xyz="0.05 0.02 0.1"/><mass value="1.5"/>
+      <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>
+      <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/><parent link="link5"/><child link="behind"/>
+      <axis xyz="0 1 0"/><limit lower="-9" upper="9" velocity="1" effort="1"/>
+      <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
+    urdf = (source / "robots/tx40.urdf").read_text()
+    (tmp_path / "robots/tx40.urdf").write_text(urdf.replace("</robot>", rod))
+    cell = tmp_path / "cells/tx40.yaml"
+    cell.write_text((source / "cells/tx40.yaml").read_text())
+    robot = calibrated_robot(cell)
+    exported = export(robot, tmp_path, capsys)
+    moving = is_moving(robot)
+    expected = robot.predicted_nm() - exported.missing_nm
+    assert apart(inverse_nm(exported.text, robot)[:, moving], expected[:, moving]) < SAME
+    simulated = loaded(exported.text)
+    data = mujoco.MjData(simulated)
+    mujoco.mj_resetDataKeyframe(simulated, data, 0)
+    leader = simulated.joint("J5").qposadr[0]
+    follower = simulated.joint("rod").qposadr[0]
+    start = data.qpos[leader]
+    data.ctrl[4] = 3.0 * np.sign(robot.calibration.gains[4].value)  # that of J5, in A
+    for _ in range(200):
+        mujoco.mj_step(simulated, data)
+    assert abs(data.qpos[leader] - start) > 0.02
+    assert data.qpos[follower] == pytest.approx(0.1 - 0.5 * data.qpos[leader], abs=2e-3)
+
+
 def test_a_planar_loop_closes_beside_its_plane(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -237,14 +237,34 @@ def test_a_follower_is_held_where_its_leader_puts_it() -> None:
     assert len(read_urdf(hold_joints(of_another, {"finger": 0.3, "thumb": 0.0})).joints) == 1
 
 
-def test_a_robot_whose_joint_mimics_another_is_refused() -> None:
-    """The equations would give it a motion of its own."""
-    with pytest.raises(
-        ModelError,
-        match=r"joint 'j' \(multiplier 2\); expected no "
-        r"<mimic>.*`closures`",
-    ):
-        robot_from_urdf(_with_gripper(TURNING + '<mimic joint="j" multiplier="2"/>', TURNING))
+@pytest.mark.parametrize(
+    ("mimic", "message"),
+    [
+        (
+            '<mimic joint="elsewhere"/>',
+            "'finger' mimics 'elsewhere', which is no joint .* that moves; expected one of j",
+        ),
+        (
+            '<mimic joint="finger"/>',
+            "'finger' mimics 'finger', which follows it in turn; expected a joint at the head",
+        ),
+    ],
+    ids=["of nothing", "of itself"],
+)
+def test_a_joint_that_follows_no_joint_is_refused(mimic: str, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        robot_from_urdf(_with_gripper(TURNING + mimic, TURNING))
+
+
+def test_a_follower_of_a_follower_follows_the_first_joint() -> None:
+    robot = robot_from_urdf(CHAINED)
+    names = [joint.name for joint in robot.joints]
+    assert [joint.name for joint in robot.axes] == ["j", "finger"]
+    ratios = {
+        names[one.follower]: (names[one.leader], one.multiplier, round(one.offset, 12))
+        for one in robot.couplings
+    }
+    assert ratios == {"thumb": ("finger", 2.0, 0.0), "tip": ("finger", -6.0, 0.5)}
 
 
 def test_a_floating_base_is_held_where_it_is() -> None:
