@@ -263,14 +263,41 @@ class EffectImpossible(EffectRefused):
 class EffectNotInstalled(EffectRefused):
     """A calibration has an effect of a package that is not installed."""
 
-    def __init__(self, effect: str, axis: str, package: str) -> None:
+    def __init__(
+        self, effect: str, axis: str, package: str, *, installed: str = "", other: str = ""
+    ) -> None:
+        """Name what is missing.
+
+        Args:
+            effect: name of the effect.
+            axis: name of its axis.
+            package: name and version of the package that the calibration names, or its module.
+            installed: version of this package that is installed and does not register the effect.
+            other: name and version of another package that has an effect of this name.
+        """
         self.effect = effect
         self.axis = axis
         self.package = package
         self.subject = f"effect {effect!r} on {axis}"
-        self.found = "no installed package that has it"
         self.expected = f"{package}, which had it when the calibration was made"
-        if package.startswith("module "):
+        if other:
+            self.found = f"an effect of this name of {other}, which may be another one"
+        elif installed:
+            self.found = f"version {installed} of its package, which does not register it"
+        else:
+            self.found = "no installed package that has it"
+        if other:
+            self.remedy = (
+                "install the one in place of the other, give the effect as an argument "
+                "(`own_effects`), or fit the logs again"
+            )
+        elif installed:
+            self.remedy = (
+                "add it to the entry points of the group drivegain.effects in the package's "
+                "pyproject.toml and install the package again, or give it as an argument "
+                "(`own_effects`)"
+            )
+        elif package.startswith("module "):
             self.remedy = (
                 "give it as an argument (`own_effects`), or install it in a package with an entry "
                 "point of the group drivegain.effects"

@@ -20,7 +20,13 @@ from ident.effects.geometry_corrections import (
     corrected_model,
     is_correction,
 )
-from ident.effects.own import known_effect, known_names
+from ident.effects.own import (
+    installed_version,
+    is_of_package,
+    known_effect,
+    known_names,
+    package_of,
+)
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectNotInstalled, EffectRefused, ModelError
@@ -289,10 +295,19 @@ def placed_effect(
     known = known_effect(accepted.name, calibration.own_effects)
     if known is None:
         if accepted.package is not None:
-            raise EffectNotInstalled(accepted.name, accepted.axis, accepted.package)
+            raise EffectNotInstalled(
+                accepted.name,
+                accepted.axis,
+                accepted.package,
+                installed=installed_version(accepted.package),
+            )
         raise EffectRefused(
             f"there is no effect {accepted.name!r}; there are {', '.join(sorted(known_names()))}"
         )
+    is_given = any(effect.name == accepted.name for effect in calibration.own_effects)
+    if accepted.package is not None and not is_given and not is_of_package(known, accepted.package):
+        other = package_of(known) or "drivegain"
+        raise EffectNotInstalled(accepted.name, accepted.axis, accepted.package, other=other)
     everywhere = not known.has_axis and accepted.axis == ALL_AXES
     if not everywhere and accepted.axis not in places:
         raise EffectRefused(

@@ -14,7 +14,7 @@ import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem
-from ident.effects.effect import Effect, is_shipped, setting_range
+from ident.effects.effect import Effect, Range, is_shipped, setting_range
 
 MOST_TRIALS = 80  #: Of settings, in one refinement
 FIRST_STEP = 0.15  #: Of the simplex, in the unit of each setting
@@ -59,10 +59,7 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
 
     start = np.array([effect.settings[name] for name in names])
     unit = _units(effect, start)
-    steps = np.vstack((np.zeros(len(names)), FIRST_STEP * np.diag(unit)))
-    least = [one.least for one in ranges]
-    largest = [one.largest for one in ranges]
-    simplex = np.clip(start + steps, least, largest)
+    simplex = _first_simplex(start, unit, ranges)
 
     def cost_in_units(values: FloatArray) -> float:
         return cost(values * unit)
@@ -81,6 +78,23 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
     if found.fun >= cost(start):
         return effect
     return changed(found.x * unit)
+
+
+def _first_simplex(start: FloatArray, unit: FloatArray, ranges: Sequence[Range]) -> FloatArray:
+    """Corners of the simplex, shape (p + 1, p): the start, and a step of each setting from it.
+
+    A step beyond the range goes the other way: cut off at its end, the simplex would be flat, and
+    never leave the end.
+    """
+    corners = [start]
+    for place, allowed in enumerate(ranges):
+        step = min(FIRST_STEP * unit[place], 0.5 * (allowed.largest - allowed.least))
+        if start[place] + step > allowed.largest:
+            step = -step
+        corner = start.copy()
+        corner[place] += step
+        corners.append(corner)
+    return np.array(corners)
 
 
 def _units(effect: Effect, start: FloatArray) -> FloatArray:

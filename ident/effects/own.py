@@ -16,7 +16,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
+from importlib.metadata import (
+    EntryPoint,
+    PackageNotFoundError,
+    entry_points,
+    packages_distributions,
+    version,
+)
 from itertools import chain
 
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
@@ -162,6 +168,36 @@ def package_of(effect: Effect) -> str | None:
     for package in packages:
         return f"{package} {version(package)}"
     return f"module {module}"
+
+
+def is_of_package(effect: Effect, package: str) -> bool:
+    """Whether an effect is of the package that a calibration names, in whichever version.
+
+    Args:
+        effect: of one's own.
+        package: as from `package_of`, when the calibration was made: an effect of a module may
+            have moved into a package since, and a package may be imported without its entry point.
+    """
+    module = f"module {type(effect).__module__}"
+    own = package_of(effect) or ""
+    return package == module or _name_of(own) == _name_of(package)
+
+
+def installed_version(package: str) -> str:
+    """Return the installed version of the package that a calibration names; empty without one."""
+    if package.startswith("module "):
+        return ""
+    try:
+        return version(_name_of(package))
+    except PackageNotFoundError:
+        return ""
+
+
+def _name_of(package: str) -> str:
+    """Name of a package without its version; a module with its word."""
+    if package.startswith("module "):
+        return package
+    return package.partition(" ")[0]
 
 
 def _package_of_entry(point: EntryPoint) -> str:

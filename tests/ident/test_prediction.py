@@ -270,6 +270,10 @@ STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
         (AcceptedEffect("magic", "J3", {}, (), 1.0, 1.0), "no effect 'magic'; there are .*spring"),
         (AcceptedEffect("spring", "J9", {}, (STIFFNESS,), 1.0, 1.0), "'J9'; there are J1, J2"),
         (
+            AcceptedEffect("spring", "J3", {}, (STIFFNESS,), 1.0, 1.0, package="springs 1.0"),
+            "found an effect of this name of drivegain, .*expected springs 1.0",
+        ),
+        (
             AcceptedEffect("spring", "J3", {"rest": 1.0}, (STIFFNESS,), 1.0, 1.0),
             "settings rest; it has none",
         ),

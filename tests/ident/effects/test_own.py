@@ -20,6 +20,8 @@ from ident.effects.own import (
     SHIPPED,
     families_of,
     installed_families,
+    installed_version,
+    is_of_package,
     known_effect,
     package_of,
     search_families,
@@ -291,7 +293,7 @@ class Site:
         self.folder = folder
 
     def install(self, package: str, code: str, effects: str = "EFFECTS") -> None:
-        """Write module and metadata of a package."""
+        """Write module and metadata of a package; without names of effects it registers none."""
         module = package.replace("-", "_")
         (self.folder / f"{module}.py").write_text(code, encoding="utf-8")
         metadata = self.folder / f"{module}-0.3.dist-info"
@@ -299,9 +301,10 @@ class Site:
         (metadata / "METADATA").write_text(
             f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.3\n", encoding="utf-8"
         )
-        (metadata / "entry_points.txt").write_text(
-            f"[drivegain.effects]\ndrag = {module}:{effects}\n", encoding="utf-8"
-        )
+        if effects:
+            (metadata / "entry_points.txt").write_text(
+                f"[drivegain.effects]\ndrag = {module}:{effects}\n", encoding="utf-8"
+            )
 
 
 @pytest.fixture
@@ -402,6 +405,42 @@ def test_a_package_that_is_not_there_is_named() -> None:
     assert (error.effect, error.axis, error.package) == ("square-drag", "J2", "drag-one 0.3")
     assert "install this package" in str(error)
     assert "own_effects" in str(ident.EffectNotInstalled("square-drag", "J2", "module drags"))
+
+
+def test_an_effect_of_the_package_that_a_calibration_names_is_used_in_any_version(
+    site: Site,
+) -> None:
+    site.install("drag-one", _code("drag-one"))
+    known = known_effect("square-drag")
+    assert known is not None
+    assert is_of_package(known, "drag-one 0.1")
+    assert is_of_package(known, "module drag_one")
+    assert not is_of_package(known, "drag-other 0.3")
+    assert not is_of_package(known, "module drags")
+
+
+def test_an_effect_of_the_same_name_of_another_package_is_not_used(site: Site) -> None:
+    site.install("drag-foreign", _code("drag-foreign"))
+    known = known_effect("square-drag")
+    assert known is not None
+    error = ident.EffectNotInstalled(
+        "square-drag", "J2", "drag-one 0.2", other=package_of(known) or ""
+    )
+    assert "found an effect of this name of drag-foreign 0.3" in str(error)
+    assert "expected drag-one 0.2" in str(error)
+    assert "own_effects" in str(error)
+
+
+def test_a_package_that_does_not_register_its_effect_is_not_to_be_installed(site: Site) -> None:
+    site.install("drag-hidden", _code("drag-hidden"), "")
+    assert known_effect("square-drag") is None
+    assert installed_version("drag-hidden 0.2") == "0.3"
+    assert installed_version("drag-missing 0.2") == ""
+    assert installed_version("module drags") == ""
+    error = ident.EffectNotInstalled("square-drag", "J2", "drag-hidden 0.2", installed="0.3")
+    assert "found version 0.3 of its package, which does not register it" in str(error)
+    assert "entry points of the group drivegain.effects" in str(error)
+    assert "install this package" not in str(error)
 
 
 def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
