@@ -325,7 +325,8 @@ def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
     (tmp_path / "robots").mkdir()
     rod = """<link name="behind"><inertial><origin xyz="0.05 0.02 0.1"/><mass value="1.5"/>
       <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>
-      <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/><parent link="link5"/><child link="behind"/>
+      <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/>
+      <parent link="link5"/><child link="behind"/>
       <axis xyz="0 1 0"/><limit lower="-9" upper="9" velocity="1" effort="1"/>
       <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
     urdf = (source / "robots/tx40.urdf").read_text()
