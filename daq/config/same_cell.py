@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from itertools import zip_longest
 
 from daq.config.cell import Cell, CellAxis
@@ -145,8 +145,7 @@ def calibrated_robot(cell: Cell) -> CalibratedRobot:
 
 
 def _drives_sha256(drives: Sequence[CalibratedDrive]) -> str:
-    listed = [[drive.axis, drive.node_id, drive.vendor_id, drive.product_code] for drive in drives]
-    return _sha256(listed)
+    return _sha256([astuple(drive) for drive in drives])
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +207,14 @@ def _differences_of_digests(
     if found.kinematics_sha256 != expected.kinematics_sha256:
         text = "joints (names, kinds, parents or motors)"
         differences.append(RobotDifference(f"other {text}", f"the same {text}"))
-    without_vendor = [replace(drive, vendor_id=None) for drive in expected.drives]
-    without_product = [replace(drive, product_code=None) for drive in expected.drives]
-    without_both = [replace(drive, product_code=None) for drive in without_vendor]
-    known = {_drives_sha256(drives) for drives in (without_vendor, without_product, without_both)}
-    known.add(expected.drives_sha256)
+    without_vendor = []
+    without_product = []
+    without_both = []
+    for drive in expected.drives:
+        without_vendor.append(replace(drive, vendor_id=None))
+        without_product.append(replace(drive, product_code=None))
+        without_both.append(replace(drive, vendor_id=None, product_code=None))
+    known = map(_drives_sha256, (expected.drives, without_vendor, without_product, without_both))
     if found.drives_sha256 not in known:
         text = "drives (node ids, vendors or product codes)"
         differences.append(RobotDifference(f"other {text}", f"the same {text}"))

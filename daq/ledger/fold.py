@@ -322,9 +322,12 @@ class History:
     @property
     def digests(self) -> frozenset[str]:
         """SHA-256 of every calibration, also of those that no change of a gain is computed with."""
-        foreign = [one.entry for one in self.other_robots]
-        incomparable = [one.entry for one in self.not_compared]
-        return frozenset(entry.digest for entry in (*self.entries, *foreign, *incomparable))
+        digests = {entry.digest for entry in self.entries}
+        for other in self.other_robots:
+            digests.add(other.entry.digest)
+        for incomparable in self.not_compared:
+            digests.add(incomparable.entry.digest)
+        return frozenset(digests)
 
     def in_force(self, target: str | None = None) -> str | None:
         """Return the digest of the calibration in a target, or in the last written one;

@@ -830,10 +830,15 @@ class _Robot(StrictModel):
     @property
     def robot(self) -> CalibratedRobot:
         """The robot."""
-        joints = tuple(CalibratedJoint(**joint.model_dump()) for joint in self.joints)
-        drives = tuple(CalibratedDrive(**drive.model_dump()) for drive in self.drives)
+        joints = []
+        for joint in self.joints:
+            joints.append(CalibratedJoint(joint.name, joint.kind, joint.parent))
+        drives = []
+        for drive in self.drives:
+            ids = (drive.node_id, drive.vendor_id, drive.product_code)
+            drives.append(CalibratedDrive(drive.axis, *ids))
         return CalibratedRobot(
-            self.kinematics_sha256, self.drives_sha256, joints, drives, self.motors
+            self.kinematics_sha256, self.drives_sha256, tuple(joints), tuple(drives), self.motors
         )
 
 
@@ -917,10 +922,12 @@ def _robot_lines(robot: CalibratedRobot) -> list[str]:
     # An object of JSON is one of YAML.
     if robot.joints:
         lines.append("  joints:")
-        lines += [f"    - {json.dumps(asdict(joint))}" for joint in robot.joints]
+        for joint in robot.joints:
+            lines.append(f"    - {json.dumps(asdict(joint))}")
     if robot.drives:
         lines.append("  drives:")
-        lines += [f"    - {json.dumps(asdict(drive))}" for drive in robot.drives]
+        for drive in robot.drives:
+            lines.append(f"    - {json.dumps(asdict(drive))}")
     if robot.motors:
         lines.append(f"  motors: {json.dumps(robot.motors)}")
     return lines
