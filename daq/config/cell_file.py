@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.arguments import A_PATH, checks_arguments
 from daq.config.cell import MILLIMETRE, Cell, CellAxis, DeclaredEffect, Limits, WeighedPayload
 from daq.config.cell_closures import ClosedChain, chain_of, platform_frame
 from daq.config.cell_schema import (
@@ -50,10 +51,12 @@ URDF = "robot.urdf"
 DRIVES = "drives/"
 
 
+@checks_arguments(path=A_PATH)
 def load_cell(path: Path | str) -> Cell:
     """Read a cell file and all it refers to.
 
     Raises:
+        UsageError: the argument is no path.
         ConfigurationError: a file is missing, is not what its schema says, or the cell is
             inconsistent.
     """

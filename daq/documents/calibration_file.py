@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
+from daq.arguments import A_FILE_TO_WRITE, A_LIST, A_PATH, checks_arguments, of_kind
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import (
     IN_ORDER,
@@ -386,10 +387,12 @@ def _as_entry(value: Any) -> Any:
     )
 
 
-def save_calibration(calibration: Calibration, path: Path) -> None:
+@checks_arguments(calibration=of_kind(Calibration), path=A_FILE_TO_WRITE)
+def save_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write `calibration` to `path` atomically, and read it back before it replaces an older file.
 
     Raises:
+        UsageError: an argument is of another type, or the path is that of a folder.
         CalibrationUnreadable: a number is not finite; nothing is written.
         OSError: from the file system; an old file stays as it was.
     """
@@ -404,7 +407,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
                 remedy="check the disk; the file was not replaced",
             )
 
-    replace_file(path, encode_calibration(calibration), check=check)
+    replace_file(Path(path), encode_calibration(calibration), check=check)
 
 
 def encode_calibration(calibration: Calibration) -> bytes:
@@ -429,7 +432,8 @@ def encode_calibration(calibration: Calibration) -> bytes:
     return (_HEADER + text).encode()
 
 
-def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibration:
+@checks_arguments(path=A_PATH, own_effects=A_LIST)
+def load_calibration(path: Path | str, own_effects: Sequence[Effect] = ()) -> Calibration:
     """Read a calibration.
 
     Args:
@@ -438,6 +442,7 @@ def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibrat
             name is enough.
 
     Raises:
+        UsageError: an argument is of another type.
         CalibrationMissing: the file does not exist, is a folder or a pipe, or cannot be read.
         CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or
             number, with its line.
@@ -448,7 +453,7 @@ def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibrat
         from ident.effects.own import families_of  # noqa: PLC0415 - reading a calibration needs no effects
 
         families_of(own_effects, "`own_effects`")
-    calibration = decode_calibration(read_calibration_bytes(path), str(path))
+    calibration = decode_calibration(read_calibration_bytes(Path(path)), str(path))
     return replace(calibration, own_effects=tuple(own_effects))
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.arguments import A_PATH, checks_arguments, of_kind, optional
 from daq.config.cell import DEGREE, Cell, model_of
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
@@ -104,6 +105,7 @@ def scaling(cell: Cell, readback: Readback) -> SiScaling:
     )
 
 
+@checks_arguments(path=A_PATH, cell=optional(of_kind(Cell)), lossy=of_kind(LossyLogs))
 def load_run(
     path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED
 ) -> tuple[Run, Cell]:
@@ -114,6 +116,7 @@ def load_run(
     partial log, of accepted losses, and of a run slower than planned.
 
     Raises:
+        UsageError: an argument is of another type.
         LogsDiffer: the given description is of another cell.
         DataError: the log cannot be read, or its samples cannot be used.
         ident.CurrentUnsigned: drives report the size of the current only.

@@ -14,6 +14,7 @@ import numpy as np
 from mcap.records import Attachment, Chunk, Header, Metadata
 from numpy.typing import NDArray
 
+from daq.arguments import A_PATH, checks_arguments
 from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.config.yaml_file import MAX_BYTES
@@ -476,10 +477,12 @@ class LogReader:
         )
 
 
+@checks_arguments(path=A_PATH)
 def read_log(path: Path | str) -> Log:
     """Read a whole log.
 
     Raises:
+        UsageError: the argument is no path.
         LogUnreadable: one of its kinds, with the place in the file.
     """
     path = Path(path)

@@ -11,6 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.arguments import (
+    A_FLAG,
+    A_FUNCTION,
+    A_LIST,
+    A_MOMENT,
+    A_WHOLE_NUMBER,
+    PATHS,
+    checks_arguments,
+    of_kind,
+    optional,
+)
 from daq.config.cell import Cell, model_of
 from daq.config.effects import place_effect
 from daq.config.policy import DEFAULT_APPLY_POLICY
@@ -281,6 +292,15 @@ _LOG = logging.getLogger("drivegain")
 BOOTSTRAP_SEED = 0  #: Of the significance tests, so that the same logs get the same verdicts
 
 
+@checks_arguments(
+    logs=PATHS,
+    holdout=PATHS,
+    cell=optional(of_kind(Cell)),
+    effects=A_FLAG,
+    created=optional(A_MOMENT),
+    progress=A_FUNCTION,
+    own_effects=A_LIST,
+)
 def fit_logs(
     logs: Sequence[Path | str],
     *,
@@ -304,14 +324,15 @@ def fit_logs(
             (`ident.Effect`).
 
     Raises:
+        UsageError: an argument is of another type.
         DataError: a log cannot be read, its samples cannot be used, or held-out runs refute the
             effects found.
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
     fitted = fit(
-        list(map(Path, logs)),
-        holdout=list(map(Path, holdout)),
+        logs,
+        holdout=holdout,
         cell=cell,
         keep_rows=effects,
         judge_holdout=not effects,
@@ -322,10 +343,21 @@ def fit_logs(
     return calibration_of(fitted, created or datetime.now(UTC))
 
 
+@checks_arguments(
+    logs=PATHS,
+    holdout=PATHS,
+    method=optional(of_kind(Method)),
+    gains_fixed=A_FLAG,
+    cell=optional(of_kind(Cell)),
+    lossy=of_kind(LossyLogs),
+    keep_rows=A_FLAG,
+    channels_as_wired=A_FLAG,
+    judge_holdout=A_FLAG,
+)
 def fit(
-    logs: Sequence[Path],
+    logs: Sequence[Path | str],
     *,
-    holdout: Sequence[Path] = (),
+    holdout: Sequence[Path | str] = (),
     method: Method | None = None,
     gains_fixed: bool = False,
     cell: Cell | None = None,
@@ -349,8 +381,12 @@ def fit(
             final model.
 
     Raises:
+        UsageError: an argument is of another type.
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
+
+    recorded = [Path(log) for log in logs]
+    held_out = [Path(log) for log in holdout]
 
     def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
         reading = Reading.of(used, cell, lossy)
@@ -390,16 +426,16 @@ def fit(
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
     recordings = Recordings(
-        tuple(logs), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired
+        tuple(recorded), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired
     )
     try:
         with named_causes(recordings):
-            judged_fit = _with_diagnoses(attempt(logs, holdout, chosen))
+            judged_fit = _with_diagnoses(attempt(recorded, held_out, chosen))
             if judge_holdout:
                 return _with_holdout_judged(judged_fit)
             return judged_fit
     except PayloadUnseen as error:
-        hint = contradicting_log(logs, lambda rest: attempt(rest, (), Method.ML))
+        hint = contradicting_log(recorded, lambda rest: attempt(rest, (), Method.ML))
         raise PayloadUnseen(error.std_percent, error.runs, hint) from error
 
 
@@ -579,6 +615,13 @@ def compare_estimators(
 DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
+@checks_arguments(
+    start=of_kind(Fit),
+    seed=A_WHOLE_NUMBER,
+    progress=A_FUNCTION,
+    undecided=of_kind(Undecided),
+    own_effects=A_LIST,
+)
 def close_loop(
     start: Fit,
     seed: int,
@@ -766,6 +809,7 @@ def check_holdout(fitted: Fit) -> None:
     )
 
 
+@checks_arguments(fitted=of_kind(Fit), created=A_MOMENT)
 def calibration_of(fitted: Fit, created: datetime) -> Calibration:
     """Make the calibration of a fit.
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.arguments import PATHS, checks_arguments, of_kind, optional
 from daq.config.cell import Cell, model_of
 from daq.config.same_cell import GRAVITY as GRAVITY_SECTION
 from daq.config.same_cell import differing_zeros, mismatch_of_calibration
@@ -115,8 +116,9 @@ class Validation:
         return int(np.count_nonzero(self.use))
 
 
+@checks_arguments(calibration=of_kind(Calibration), logs=PATHS, cell=optional(of_kind(Cell)))
 def validate(
-    calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None
+    calibration: Calibration, logs: Sequence[Path | str], cell: Cell | None = None
 ) -> tuple[Validation, ...]:
     """Predict every log with a calibration.
 
@@ -126,6 +128,7 @@ def validate(
         cell: corrected description of the same cell, which replaces the one in the logs.
 
     Raises:
+        UsageError: an argument is of another type.
         DataError, ConfigurationError: a log cannot be used.
         LogsDiffer: a log is of another cell.
         CalibrationUnreadable: the calibration does not say its filter.
@@ -135,7 +138,7 @@ def validate(
     conditioning_of(calibration)  # refuses a calibration without a filter before any log is read
     validations: list[Validation] = []
     corrections = Corrections()
-    for log in logs:
+    for log in map(Path, logs):
         run, described = load_run(log, cell)
         corrections.note(log, run)
         check_cell(calibration, log, described)

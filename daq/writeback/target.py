@@ -17,6 +17,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+from daq.arguments import (
+    A_MOMENT,
+    A_PATH,
+    A_TEXT,
+    argument_refused,
+    checks_arguments,
+    of_kind,
+    optional,
+    with_methods,
+)
 from daq.config.cell import Cell
 from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, counted, evidence, reason_of
 from daq.files import sha256
@@ -138,19 +148,30 @@ class Proposal(Generic[E]):
         )
 
 
+A_TARGET = with_methods("a FileTarget or a DriveTarget", "plan", "plan_rollback", "write")
+
+
+@checks_arguments(target=A_TARGET, request=of_kind(Request))
 def propose(target: Target[E], request: Request) -> Proposal[E]:
     """Plan what a calibration changes in a target, and check every gate; reads only.
 
     Raises:
-        UsageError: the value of --base is no digest.
+        UsageError: the value of --base is no digest, or an argument is of another type.
         ConfigurationInconsistent, CalibrationRefused, ControllerUnfit: see `Target.plan`.
         DriverError: from the drives.
     """
+    for name, expected in (("calibration", of_kind(Calibration)), ("now", A_MOMENT)):
+        value = getattr(request, name)
+        if not expected.is_met(value):
+            raise argument_refused(
+                f"{name} of the request", value, expected, "write Request(calibration, now)"
+            )
     edit = target.plan(request.calibration)
     refusals = check_gates(GateContext(request, edit, target.cell))
     return Proposal(target, request, edit, refusals)
 
 
+@checks_arguments(proposal=of_kind(Proposal), now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)
 def apply(
     proposal: Proposal[E], now: datetime, *, audit: Path | None = None, who: str = ""
 ) -> Written | None:
@@ -170,6 +191,7 @@ def apply(
         history cannot take it: a warning is logged, and the change says why.
 
     Raises:
+        UsageError: an argument is of another type; nothing was written.
         CalibrationRefused: a check failed; every failed one is listed.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         OutputFailed: the file system failed once the new content was in place, or so that the
@@ -199,6 +221,7 @@ def apply(
         raise
 
 
+@checks_arguments(target=A_TARGET, now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)
 def rollback(
     target: Target[E],
     now: datetime,
@@ -219,6 +242,7 @@ def rollback(
         planned: rollback that was planned and shown already.
 
     Raises:
+        UsageError: an argument is of another type; nothing was written.
         CalibrationRefused: see `Target.plan_rollback`.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
