@@ -20,7 +20,13 @@ from daq.documents.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
+from daq.errors import (
+    CalibrationMissing,
+    CalibrationRefused,
+    CalibrationUnreadable,
+    UsageError,
+    exit_code,
+)
 from ident.calibration import Calibration, PayloadMass
 from ident.errors import EffectRefused
 from tests.daq.calibrations import calibrations, demo_calibration
@@ -219,8 +225,13 @@ def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize("given_as", [None, "spring", 3.0])
-def test_own_effects_that_are_no_list_of_effects_are_refused_before_a_file_is_used(
+def test_own_effects_that_are_no_list_are_refused_before_a_file_is_used(
     path: Path, given_as: Any
 ) -> None:
-    with pytest.raises(EffectRefused, match=r"^`own_effects`: found .*; expected "):
+    with pytest.raises(UsageError, match=r"own_effects.*found .*; expected "):
         load_calibration(path, own_effects=given_as)
+
+
+def test_own_effects_that_are_no_effects_are_refused_before_a_file_is_used(path: Path) -> None:
+    with pytest.raises(EffectRefused, match=r"^`own_effects`: found .*; expected "):
+        load_calibration(path, own_effects=[3.0])  # type: ignore[list-item]
