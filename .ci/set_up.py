@@ -68,7 +68,7 @@ class Progress:
 
 
 def packages_in(lock: str) -> int:
-    """Return the number of requirements in the text of a lock, those for other machines included."""  # noqa: E501
+    """Return the number of requirements in a lock, those for other machines included."""
     return len(re.findall(r"^[^\s#]+==", lock, re.MULTILINE))
 
 

@@ -278,6 +278,7 @@ class EffectNotInstalled(EffectRefused):
         self.effect = effect
         self.axis = axis
         self.package = package
+        self.state = "not registered" if installed else "not installed"
         self.subject = f"effect {effect!r} on {axis}"
         self.expected = f"{package}, which had it when the calibration was made"
         if other:

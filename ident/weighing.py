@@ -13,10 +13,10 @@ calibration. Without such runs, χ and c are the calibration's, except the frict
 which is found again because it changes with the temperature.
 
 σ has three parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`).
-Another, S C Sᵀ, is what the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ,
-c). The last is the tolerance u_k of the mass m_k of each payload that gave the calibration its
-scale, which C lacks: p moves by the vector S ∂(g, χ, c)/∂m_k u_k, and its outer product with itself
-is added. Where that mass was all that was known, the vector is p u_k/m_k.
+Another, S C Sᵀ, is what the errors of the calibration do to p: C is its covariance,
+S = ∂p/∂(g, χ, c). The last is the tolerance u_k of the mass m_k of each payload that gave the
+calibration its scale, which C lacks: p moves by the vector S ∂(g, χ, c)/∂m_k u_k, and its outer
+product with itself is added. Where that mass was all that was known, the vector is p u_k/m_k.
 """
 
 from __future__ import annotations
@@ -138,9 +138,7 @@ class WeighedBody:
 
     @property
     def centre_m(self) -> tuple[FloatArray, FloatArray]:
-        """Centre of mass in the frame of the joint that carries it, and its σ [m], shape (3,)
-        each.
-        """
+        """Centre of mass in the carrying joint's frame and its σ [m], shapes (3,)."""
         return self._derived(_centre)
 
     def centre_in(self, frame: Place) -> tuple[FloatArray, FloatArray]:
@@ -302,7 +300,7 @@ def _corrected(given: RowsToWeigh, corrections: tuple[PlacedEffect, ...]) -> Row
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _CalibratedRobot:
+class _CalibratedValues:
     """What a calibration says of the robot, in the order of the columns that a body is weighed
     with.
     """
@@ -420,14 +418,14 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     )
 
 
-def _robot_of(calibration: Calibration, model: Model) -> _CalibratedRobot:
+def _robot_of(calibration: Calibration, model: Model) -> _CalibratedValues:
     effects = []
     coefficients = []
     for accepted in calibration.effects:
         placed, values = left_of(*placed_effect(accepted, calibration))
         effects.append(placed)
         coefficients.append(values)
-    return _CalibratedRobot(
+    return _CalibratedValues(
         model=model,
         gains=np.array([gain.value for gain in calibration.gains]),
         standard=standard_parameters(calibration, model),
@@ -437,7 +435,7 @@ def _robot_of(calibration: Calibration, model: Model) -> _CalibratedRobot:
     )
 
 
-def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _WeighingSolution:
+def _solved(robot: _CalibratedValues, given: RowsToWeigh) -> _WeighingSolution:
     """Solve for the body, again and again while its torques change the columns of the effects."""
     without_body = given.datasets[: given.bare]
     with_body = given.datasets[given.bare :]
@@ -456,7 +454,7 @@ def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _WeighingSolution:
 
 
 def _solved_with(
-    robot: _CalibratedRobot, given: RowsToWeigh, signals: Sequence[Signals]
+    robot: _CalibratedValues, given: RowsToWeigh, signals: Sequence[Signals]
 ) -> _WeighingSolution:
     """Solve for the body, with the columns of the effects from these signals."""
     rows = given.rows

@@ -396,8 +396,8 @@ def _run(words: list[str], json_wanted: bool) -> int:
             words, prog_name="drivegain", standalone_mode=False
         )
     except (DaqError, DriverError, IdentificationError) as error:
-        is_told = isinstance(error, OutputFailed) or bool(CHANGED)
-        if is_told and _kept():
+        left_something = isinstance(error, OutputFailed) or bool(CHANGED)
+        if left_something and _kept():
             error.add_note(f"kept: {_kept()}")
         failure = ErrorParts.of(error, _verb_of(words))
         show_failure(failure, json_wanted=json_wanted)

@@ -25,21 +25,25 @@ if TYPE_CHECKING:
     from ident.model.model import Model
 
 
+CellUnlessUrdf = Annotated[
+    Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")
+]
+CalibrationToExport = Annotated[
+    Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
+]
+UrdfOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."
+    ),
+]
+
+
 def export_urdf_verb(
-    cell: Annotated[
-        Path,
-        typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf."),
-    ],
+    cell: CellUnlessUrdf,
     out: Annotated[Path, output_option("--out", "URDF to write.")],
-    calibration: Annotated[
-        Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option(
-            "--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."
-        ),
-    ] = None,
+    calibration: CalibrationToExport = None,
+    urdf: UrdfOption = None,
     json: JsonOption = False,
 ) -> None:
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
@@ -105,20 +109,10 @@ def export_urdf_verb(
 
 
 def export_mjcf_verb(
-    cell: Annotated[
-        Path,
-        typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf."),
-    ],
+    cell: CellUnlessUrdf,
     out: Annotated[Path, output_option("--out", "MJCF model to write (.xml).")],
-    calibration: Annotated[
-        Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option(
-            "--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."
-        ),
-    ] = None,
+    calibration: CalibrationToExport = None,
+    urdf: UrdfOption = None,
     json: JsonOption = False,
 ) -> None:
     """Write the calibrated robot as an MJCF model for MuJoCo 3.3.1 or later.

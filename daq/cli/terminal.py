@@ -168,9 +168,7 @@ def remove_empty_folders() -> None:
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
-    """Refuse an output file that would overwrite an input, or a file without ``format:
-    …`` in its first lines.
-    """
+    """Refuse to overwrite an input, or a file that does not begin with its format."""
     if out is None or not out.exists():
         return
     if any(given is not None and given.exists() and out.samefile(given) for given in inputs):

@@ -65,7 +65,10 @@ if TYPE_CHECKING:
     FilePath = Path
 else:
     FilePath = Annotated[FileName, AfterValidator(_beside)]
-    """A path relative to the file that names it; absolute where `read_model` knows the folder of that file."""  # noqa: E501
+    """A path relative to the file that names it.
+
+    It is absolute where `read_model` knows the folder of that file.
+    """
 
 
 class DocumentKind(Enum):

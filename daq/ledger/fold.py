@@ -292,7 +292,7 @@ _BEGINS = {
     AuditAction.APPLY_BEGUN: WriteAction.APPLIED,
     AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK,
 }
-_NEVER = datetime.min.replace(tzinfo=UTC)
+NEVER = datetime.min.replace(tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -596,11 +596,11 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     if entry.action is not AuditAction.CALIBRATION_ENTERED or text_field(entry, "cell") != cell:
         return None
     digest = text_field(entry, "sha256")
-    entered = utc(text_field(entry, "entered") or "", _NEVER)
+    entered = utc(text_field(entry, "entered") or "", NEVER)
     document = text_field(entry, "document")
     figures = entry.details.get("figures")
     known = figures if isinstance(figures, dict) else None
-    if digest is None or entered == _NEVER or (document is None and known is None):
+    if digest is None or entered == NEVER or (document is None and known is None):
         return None
     at = at_of(entry) or entered
     return EnteredCalibration(
@@ -623,10 +623,10 @@ def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     axis = text_field(entry, "axis")
     why = text_field(entry, "why")
     at = at_of(entry)
-    since = utc(text_field(entry, "since") or "", _NEVER)
+    since = utc(text_field(entry, "since") or "", NEVER)
     if entry.action is not AuditAction.ACKNOWLEDGED or axis is None or why is None or at is None:
         return None
-    if not _NEVER < since <= at:
+    if not NEVER < since <= at:
         return None
     return Acknowledgement(axis, since, at, entry.who, why, entry.sha256)
 
@@ -823,8 +823,8 @@ def name_after_renames(entries: Sequence[AuditEntry], name: str, since: datetime
 
 def at_of(entry: AuditEntry) -> datetime | None:
     """Return when an entry was written, UTC; None where its time is none."""
-    found = utc(entry.at, _NEVER)
-    return None if found == _NEVER else found
+    found = utc(entry.at, NEVER)
+    return None if found == NEVER else found
 
 
 def text_field(entry: AuditEntry, key: str) -> str | None:

@@ -439,8 +439,9 @@ def _readings(
 def _start(
     wanted: ImportDescription, files: dict[str, Table], clock: Clock | None
 ) -> tuple[int, int, Timing | None]:
-    """Return the first stamp of the log and the time of day [ns;
-    0 where unknown], and the timing with the former.
+    """Return the first stamp and the wall time of the log [ns], and its timing.
+
+    Both times are 0 where they are unknown, and there is no timing then.
     """
     if wanted.time is None or clock is None:
         return 0, 0, None

@@ -277,9 +277,7 @@ def info_report(path: Path) -> InfoReport:
 
 
 def timing_text(timing: Timing) -> str:
-    """Describe the time stamps of an import in a sentence: `stamps at 90.9 Hz:
-    steps of 12 ms at most, ...`.
-    """
+    """Describe the time stamps of an import, for a sentence."""
     parts = [
         f"usual step {1e3 * timing.usual_step_s:.6g} ms, longest "
         f"{1e3 * timing.longest_step_s:.6g} ms",

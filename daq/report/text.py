@@ -113,9 +113,7 @@ def break_lines(text: str, width: int) -> str:
 
 
 _COMMAND_LINE = re.compile(r"\s*(?:[\w ]+: )?(?:drivegain |--\w)")
-"""Begin of a line that is a command: `Next:
-drivegain …`, or the options that are to be added to one.
-"""
+"""A line that begins with a command, or with the options to add to one."""
 _COMMAND_OR_WORD = re.compile(r"[^\s`]*`[^`]*`[^\s`]*|\S+")
 
 

@@ -100,9 +100,9 @@ def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, .
     for accepted in calibration.effects:
         try:
             placed_effect(accepted, calibration)
-        except EffectNotInstalled:
+        except EffectNotInstalled as error:
             missing.append(
-                f"{accepted.name} on {accepted.axis} (of {accepted.package}, not installed)"
+                f"{accepted.name} on {accepted.axis} (of {accepted.package}, {error.state})"
             )
             gone |= {coefficient.name for coefficient in accepted.coefficients}
         else:

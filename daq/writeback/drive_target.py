@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -30,7 +30,7 @@ from daq.errors import (
     counted,
 )
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.fold import utc
+from daq.ledger.fold import NEVER, utc
 from daq.ledger.ledger import present_name
 from daq.ledger.names import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
@@ -371,8 +371,7 @@ class DriveTarget:
         unknown_axes = [
             note.axis for note in record.drives if (note.axis, note.node_id) not in axes
         ]
-        never = datetime.min.replace(tzinfo=UTC)
-        present = present_name(self.cell, record.cell, utc(record.at, never))
+        present = present_name(self.cell, record.cell, utc(record.at, NEVER))
         if present != self.cell.name or unknown_axes:
             found = f"a write to cell {record.cell!r} at {record.at}"
             if present != record.cell:

@@ -57,7 +57,9 @@ def next_state(
         after = PowerState.READY_TO_SWITCH_ON
     elif state is PowerState.SWITCH_ON_DISABLED:
         after = state  # switch on needs READY TO SWITCH ON first
-    else:  # switch on (3, 5); enable operation (4, and from READY TO SWITCH ON through SWITCHED ON, which is allowed)  # noqa: E501
+    else:
+        # Switch on (3, 5); enable operation (4), also from READY TO SWITCH ON through SWITCHED ON,
+        # which is allowed.
         after = PowerState.SWITCHED_ON
         if controlword & 0x08:
             after = PowerState.OPERATION_ENABLED

@@ -87,9 +87,7 @@ class TimedSync:
 
 
 class Producer:
-    """Sends SYNC on our behalf; this one keeps its period by itself,
-    and goes on after the last cycle.
-    """
+    """A SYNC producer that keeps its period by itself, also after the last cycle."""
 
     #: Whether it is this machine's kernel; a SYNC from the wire is then another device's
     in_kernel = False

@@ -100,14 +100,14 @@ class Compensator(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Counterbalance(Effect):
-    """τ = c₀ sin x / w + c₁ sin x (1 − (1 − ρ)/w),  w = √(1 + ρ² − 2ρ cos x),  x = q − α;  c₀,
-    c₁ > 0: it pulls.
+    """τ = c₀ sin x / w + c₁ sin x (1 − (1 − ρ)/w),  w = √(1 + ρ² − 2ρ cos x),  x = q − α;
+    c₀, c₁ > 0: it pulls.
 
     A balancer pulls a lever of length L on the moving link towards its foot, at a from the axis on
     the link before; ρ = l/b with l = min(a, L) and b = max(a, L), and α is the position where the
-    lever points at the foot. Its length is s = b w, shortest at s₁ = b (1 − ρ), and its force F =
-    F₁ + k (s − s₁) gives the torque F ds/dq: c₀ = F₁ l is the preload's share and c₁ = k a L the
-    spring's. The motor must push away from q = α. Source: Klimchik, Wu, Caro, Dumas, Furet &
+    lever points at the foot. Its length is s = b w, shortest at s₁ = b (1 − ρ), and its force
+    F = F₁ + k (s − s₁) gives the torque F ds/dq: c₀ = F₁ l is the preload's share and c₁ = k a L
+    the spring's. The motor must push away from q = α. Source: Klimchik, Wu, Caro, Dumas, Furet &
     Pashkevich (2013), "Modelling of the gravity compensators in robotic manufacturing cells".
 
     sin x is gravity's torque, too. Where nothing else shows the first moments of the links, it

@@ -34,8 +34,7 @@ CORRELATED = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Jacobian:
-    """A matrix with the rows of all motors below each other,
-    of which each holds the unknowns of its motor alone.
+    """Jacobian stored motor by motor, without the unknowns that a motor does not have.
 
     The equation of a motor near the flange has few of them: less than half of the numbers of the
     matrix are stored.

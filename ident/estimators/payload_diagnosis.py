@@ -1,5 +1,4 @@
-"""Whether each run carries the payload that it says:
-a body that was turned, left off or exchanged, by run.
+"""Find runs that do not carry the payload they declare: it was turned, left off or exchanged.
 
 Where the declared masses of several payloads contradict each other, these are named, and no run.
 """

@@ -25,8 +25,8 @@ The covariance C of the estimate comes from leaving out moves; its rank is their
 its inverse is no weight. RᵀR is divided by the mean ratio of the variances in C to those in (RᵀR)⁻¹
 instead, which makes data and prior comparable.
 
-**Gains.** The gains stay those of the estimate, and the parameters are those that belong to them: g
-= ĝ in x. What the prior would make of the gains, with g free, is a second solution of the same
+**Gains.** The gains stay those of the estimate, and the parameters are those that belong to them:
+g = ĝ in x. What the prior would make of the gains, with g free, is a second solution of the same
 equations (`FullParameters.gains`).
 
 **σ and flags.** A solution is linear, x̂ = A θ̂ + B ε with ε the prior's deviations of one. Its

@@ -188,7 +188,7 @@ def _until(done: Callable[[], bool], seconds: float) -> bool:
 
 
 # -- the faults
-# --------------------------------------------------------------------------------------------------------  # noqa: E501
+# ------------------------------------------------------------------------------------------------
 
 
 def _strike(outcome: Round, stage: Stage) -> None:
@@ -332,7 +332,7 @@ def _foreign(fault: Fault, recorder_id: int, random: Random) -> tuple[int, bytes
 
 
 # -- what is left
-# ------------------------------------------------------------------------------------------------------  # noqa: E501
+# ------------------------------------------------------------------------------------------------
 
 
 def _look(outcome: Round, objects: Objects, before: dict[int, tuple[int | None, ...]]) -> None:

@@ -23,7 +23,13 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from queue import Queue
 
-from tests.mutation.coverage_map import FAST, CoverageMap, environment_of, measured_map
+from tests.mutation.coverage_map import (
+    FAST,
+    NO_TESTS_WERE_COLLECTED,
+    CoverageMap,
+    environment_of,
+    measured_map,
+)
 from tests.mutation.mutants import Mutant, compiles, mutants_of
 from tests.studies.output import print_line
 
@@ -236,7 +242,7 @@ def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         return "timeout"
-    if process.returncode in (0, 5):
+    if process.returncode in (0, NO_TESTS_WERE_COLLECTED):
         return ""
     failed = [line for line in printed.splitlines() if line.startswith(("FAILED ", "ERROR "))]
     if failed:
@@ -245,8 +251,13 @@ def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
 
 
 def _tree_of_head(folder: Path) -> Path:
-    """Clone of what is committed, where faults can be planted: some tests ask git for the files."""
-    if not folder.exists():
+    """Clone of what is committed, where faults can be planted: some tests ask git for the files.
+
+    A run that was killed has left its fault in there: it is taken out.
+    """
+    if folder.exists():
+        subprocess.run(["git", "checkout", "--quiet", "--", "."], cwd=folder, check=True)
+    else:
         part = folder.with_suffix(".part")
         shutil.rmtree(part, ignore_errors=True)
         part.parent.mkdir(parents=True, exist_ok=True)

@@ -441,6 +441,9 @@ def test_a_package_that_does_not_register_its_effect_is_not_to_be_installed(site
     assert "found version 0.3 of its package, which does not register it" in str(error)
     assert "entry points of the group drivegain.effects" in str(error)
     assert "install this package" not in str(error)
+    assert error.state == "not registered"
+    missing = ident.EffectNotInstalled("square-drag", "J2", "drag-hidden 0.2")
+    assert missing.state == "not installed"
 
 
 def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
