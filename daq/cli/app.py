@@ -396,9 +396,11 @@ def _run(words: list[str], json_wanted: bool) -> int:
             words, prog_name="drivegain", standalone_mode=False
         )
     except (DaqError, DriverError, IdentificationError) as error:
-        left_something = isinstance(error, OutputFailed) or bool(CHANGED)
-        if left_something and _kept():
-            error.add_note(f"kept: {_kept()}")
+        kept = ""
+        if CHANGED or isinstance(error, OutputFailed):
+            kept = _kept()
+        if kept:
+            error.add_note(f"kept: {kept}")
         failure = ErrorParts.of(error, _verb_of(words))
         show_failure(failure, json_wanted=json_wanted)
         return failure.exit_code
