@@ -265,7 +265,7 @@ class Experiment:
             [moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))]
         )
         if self.design.expectation.model.is_redundant:
-            return use.all(axis=0) & use
+            use &= use.all(axis=0)
         return use
 
 

@@ -170,8 +170,10 @@ def differentiate(
     valid &= ~clipped
     # If the log has no moves, a new one begins after every standstill of all joints.
     any_moving = np.any(moving, axis=0)
+    move: FloatArray | IntArray
     if logged is None:
-        move = np.cumsum(np.diff(any_moving.astype(np.int64), prepend=1) > 0)
+        begins_to_move = np.diff(any_moving.astype(np.int64), prepend=1) > 0
+        move = np.cumsum(begins_to_move)
     else:
         move = logged[1:-1]
     # Long moves are split: σ and folds need many moves, and continuous motion would be a single
