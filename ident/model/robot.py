@@ -91,12 +91,16 @@ class Robot:
     @property
     def carrier(self) -> int:
         """Index of the joint whose link carries the payload."""
-        return self.joint_count - 1 if self.platform is None else self.platform.joint
+        if self.platform is None:
+            return self.joint_count - 1
+        return self.platform.joint
 
     @property
     def mounting_m(self) -> FloatArray:
         """Where the payload is mounted, in the frame of the joint that carries it, shape (3,)."""
-        return np.zeros(3) if self.platform is None else self.platform.translation_m
+        if self.platform is None:
+            return np.zeros(3)
+        return self.platform.translation_m
 
     @property
     def axis_joints(self) -> tuple[int, ...]:
@@ -116,8 +120,9 @@ class Robot:
     @property
     def places(self) -> tuple[Joint, ...]:
         """Where an effect can act: the driven joints, those without a motor, and the pivots that loops are cut at."""
-        passive = (self.joints[joint] for joint in self.passive_joints)
-        return (*self.axes, *passive, *map(self._as_joint, self.pivots))
+        passive = [self.joints[joint] for joint in self.passive_joints]
+        pivots = [self._as_joint(pivot) for pivot in self.pivots]
+        return (*self.axes, *passive, *pivots)
 
     def _as_joint(self, pivot: Pivot) -> Joint:
         closure = self.closures[pivot.closure]
@@ -197,26 +202,38 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     samples, count = position_rad.shape
     rotation = np.empty((count + 1, samples, 3, 3))
     origin = np.empty((count + 1, samples, 3))
-    rotation[0], origin[0] = np.eye(3), 0.0
+    rotation[0] = np.eye(3)
+    origin[0] = 0.0
     own = _own_rotations(robot, position_rad)
     for index, joint in enumerate(robot.joints):
-        parent = rotation[joint.parent + 1]
-        np.add(origin[joint.parent + 1], parent @ joint.translation_m, out=origin[index + 1])
+        before = joint.parent + 1
+        here = index + 1
+        parent = rotation[before]
+        np.add(origin[before], parent @ joint.translation_m, out=origin[here])
         if joint.kind is JointKind.PRISMATIC:
-            origin[index + 1] += position_rad[:, index, None] * (parent @ (joint.rotation @ joint.axis))
-        np.matmul(parent, own[index], out=rotation[index + 1])
+            direction = parent @ (joint.rotation @ joint.axis)
+            origin[here] += position_rad[:, index, None] * direction
+        np.matmul(parent, own[index], out=rotation[here])
     return Poses(rotation, origin)
 
 
 def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
-    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3): Rodrigues' formula for all joints at once."""
-    axes = np.array([joint.axis for joint in robot.joints])
+    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3).
+
+    Rodrigues' formula for all joints at once, R = R₀ (a aᵀ + cos q (1 − a aᵀ) + sin q [a]).
+    """
+    joints = robot.joints
+    axes = np.array([joint.axis for joint in joints])
+    fixed = np.array([joint.rotation for joint in joints])
+    is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in joints])
     outer = axes[:, :, None] * axes[:, None]
-    turns = np.stack((outer, np.eye(3) - outer, np.array([skew(axis) for axis in axes])), axis=1)
-    turns = np.array([joint.rotation for joint in robot.joints])[:, None] @ turns
-    turned = position_rad.T * np.array([[joint.kind is JointKind.REVOLUTE] for joint in robot.joints])
-    factors = np.stack((np.ones_like(turned), np.cos(turned), np.sin(turned)), axis=2)
-    return np.asarray((factors @ turns.reshape(-1, 3, 9)).reshape(*turned.shape, 3, 3))
+    crosses = np.array([skew(axis) for axis in axes])
+    parts = np.stack((outer, np.eye(3) - outer, crosses), axis=1)
+    parts = fixed[:, None] @ parts
+    angle = position_rad.T * is_revolute[:, None]
+    factors = np.stack((np.ones_like(angle), np.cos(angle), np.sin(angle)), axis=2)
+    rotations = factors @ parts.reshape(-1, 3, 9)
+    return np.asarray(rotations.reshape(*angle.shape, 3, 3))
 
 
 def skew(vector: FloatArray) -> FloatArray:
