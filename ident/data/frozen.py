@@ -71,7 +71,7 @@ def frozen_to_the_end(readings: Readings, others: FloatArray) -> IntArray:
     if not (is_at_end and _go_on(others, later)):
         return _no_stretch()
     until_stop = _course(readings)[: begin + 1]
-    if not _stops_abruptly(until_stop, _samples_beside(readings), readings.count):
+    if not _stops_abruptly(until_stop, _samples_of_span(readings), readings.count):
         return _no_stretch()
     return _samples(readings, [(first, last)])
 
@@ -125,7 +125,7 @@ def _abrupt(readings: Readings) -> IntArray:
     """Stretches in which a position is constant and that begin or end without any acceleration, shape (s, 2)."""
     rounding = _rounding(readings)
     stretches = _constant(readings, rounding, LEAST_S)
-    span = _samples_beside(readings)
+    span = _samples_of_span(readings)
     course = _course(readings)
     if not stretches or len(course) <= 4 * span:
         return _no_stretch()
@@ -193,7 +193,7 @@ def _rounding(readings: Readings) -> float:
     return ROUNDING * float(np.ptp(readings.values))
 
 
-def _samples_beside(readings: Readings) -> int:
+def _samples_of_span(readings: Readings) -> int:
     """Samples in BESIDE_S."""
     return max(LEAST_BESIDE, round(BESIDE_S * readings.rate_hz))
 

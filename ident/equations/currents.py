@@ -14,7 +14,7 @@ most likely λ of each sample, for given g and σ, leaves
     e = T_D (V g − τ),    T_D = P D⁻¹,    P = 1 − D⁻¹N (NᵀD⁻²N)⁻¹ NᵀD⁻¹,
 
 whose entries are the corrections of the currents in units of their σ: a total least squares, as before. P changes from
-sample to sample, so the rows are kept (`PreloadedCurrents`). The columns of g are those of corrected currents: with
+sample to sample, so the rows stay (`PreloadedCurrents`). The columns of g are those of corrected currents: with
 measured ones their noise would make the gains smaller (errors in variables; Golub & Van Loan, SIAM J. Numer. Anal. 17
 (1980)).
 """

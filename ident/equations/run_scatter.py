@@ -6,7 +6,7 @@ the noise and of s, with N the torque per unit of b, their errors have the covar
     V = 1 + N Nᵀ = 1 + U diag(λ) Uᵀ,      V^(−1/2) = 1 − U diag(1 − 1/√(1 + λ)) Uᵀ,
 
 U the left singular vectors of N and λ its squared singular values. Rows multiplied by V^(−1/2) have independent errors
-again (generalised least squares; Aitken, Proc. R. Soc. Edinburgh 55 (1936)): of the deviations of whole runs little is
+again (generalised least squares; Aitken, Proc. R. Soc. Edinburgh 55 (1936)): of the deviations of entire runs little is
 left in them, and nothing that a candidate explains of it counts. Errors of rows that were left out stay independent of
 the others, so folds of moves and of runs need no change. Deviations of a joint that two motors turn are taken as two.
 """

@@ -121,7 +121,7 @@ class Checker:
         self._first, self._second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
 
     def margins(self, position: FloatArray) -> FloatArray:
-        """Compute the smallest distance beyond the minimum in each posture [m], negative where it is not kept.
+        """Compute the smallest distance beyond the minimum in each posture [m], negative where bodies are closer.
 
         Args:
             position: of the axes [rad or m], shape (k, m).
